@@ -320,7 +320,15 @@ def finish(options: argparse.Namespace, describe: Callable[[], Account], written
     return 0 if account.good else 1
 
 
-def conclude(options: argparse.Namespace, account: Account) -> int:
-    """Report what a command that writes no file has found, and return the exit status."""
-    report.emit_verdict(account.facts, options.json, "\n".join(account.lines))
+def conclude(options: argparse.Namespace, account: Account, written: Path | None = None) -> int:
+    """Report what a command has found, and return the exit status; ``written`` is the file that it has written, if any.
+
+    BrokenPipeError when no file is written, standard output is closed and ``--json`` names no file, so that nobody can
+    read the report.
+    """
+    if written is not None:
+        return finish(options, lambda: account, written)
+    if options.json is None:
+        process.require_output()
+    report.emit(account.facts, options.json, "\n".join(account.lines))
     return 0 if account.good else 1

@@ -15,7 +15,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from quasiharmonic.ui.cli.process import require_output, tell
+from quasiharmonic.ui.cli.process import tell
 
 if TYPE_CHECKING:
     from quasiharmonic.problem import Domain
@@ -93,16 +93,6 @@ def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
     print(text, flush=True)
 
 
-def emit_verdict(facts: dict[str, Any], destination: str | None, text: str) -> None:
-    """`emit` for a command that writes no file.
-
-    BrokenPipeError when standard output is closed and ``--json`` names no file, so that nobody can read the report.
-    """
-    if destination is None:
-        require_output()
-    emit(facts, destination, text)
-
-
 def check_outputs(options: argparse.Namespace, inputs: Sequence[Path | None]) -> None:
     """Check before any work that outputs can be written and do not replace other files.
 
@@ -113,38 +103,33 @@ def check_outputs(options: argparse.Namespace, inputs: Sequence[Path | None]) ->
     from quasiharmonic import io
 
     io.check_output(options.output)
-    plot, pattern = getattr(options, "plot", None), getattr(options, "pattern", None)
-    if plot is not None:
-        check_picture("--plot", plot, inputs)
-    outputs = {"--plot": plot, "--pattern": pattern, "--json": _json_file(options.json)}
-    _check_distinct(outputs, inputs, {options.output: "the map (-o)"})
+    outputs = {f"--{name}": getattr(options, name, None) for name in ("plot", "pattern")}
+    if outputs["--plot"] is not None:
+        check_picture("--plot", outputs["--plot"], inputs)
+    check_new(outputs, options.json, inputs, {options.output: "the map (-o)"})
 
 
-def _json_file(json_path: str | None) -> Path | None:
-    """Return the file of ``--json``, if it names one."""
-    return None if json_path in (None, "-") else Path(str(json_path))
+def check_new(
+    outputs: Mapping[str, Path | None],
+    json_path: str | None,
+    inputs: Sequence[Path | None],
+    others: Mapping[Path, str] | None = None,
+) -> None:
+    """Like `check_outputs`, for files that must replace neither an input nor each other.
 
-
-def check_moved(output: Path, json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """Like `check_outputs`, for a mesh in a format whose suffix another library checks."""
-    _check_replaces_nothing("-o", output, inputs)
-    check_new({}, json_path, (*inputs, output))
-
-
-def check_new(outputs: Mapping[str, Path | None], json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """Like `check_outputs`, for files that must not replace any input.
-
-    ``outputs`` maps descriptions to paths, or to None.
+    ``outputs`` maps descriptions to paths, or to None. ``others`` are outputs that are already checked, with their
+    descriptions.
     """
-    _check_distinct({**outputs, "--json": _json_file(json_path)}, inputs, {})
+    from quasiharmonic import io
 
-
-def _check_distinct(outputs: Mapping[str, Path | None], inputs: Sequence[Path | None], taken: dict[Path, str]) -> None:
-    """Check that outputs replace neither an input nor each other, nor the outputs ``taken`` with their descriptions."""
-    for what, path in outputs.items():
+    taken = dict(others or {})
+    json_file = None if json_path in (None, "-") else Path(str(json_path))
+    for what, path in {**outputs, "--json": json_file}.items():
         if path is None:
             continue
-        _check_replaces_nothing(what, path, inputs)
+        io.check_writable(path)
+        if any(_is_same_file(path, source) for source in inputs if source is not None):
+            raise ValueError(f"{what} {path} would replace an input file")
         for other, name in taken.items():
             if _is_same_file(path, other):
                 raise ValueError(f"{what} {path} is also the file of {name}")
@@ -157,23 +142,7 @@ def check_picture(
     """Like `check_outputs`, for a picture."""
     if path.suffix.lower() not in endings:
         raise ValueError(f"{option} {path}: pictures are written as {', '.join(endings)}")
-    _check_replaces_nothing(option, path, inputs)
-
-
-def check_export(path: Path, inputs: Sequence[Path | None]) -> None:
-    """Like `check_outputs`, for values per triangle."""
-    from quasiharmonic import io
-
-    io.find_format(path, "encode_values")
-    _check_replaces_nothing("--export", path, inputs)
-
-
-def _check_replaces_nothing(option: str, path: Path, inputs: Sequence[Path | None]) -> None:
-    from quasiharmonic import io
-
-    io.check_writable(path)
-    if any(_is_same_file(path, source) for source in inputs if source is not None):
-        raise ValueError(f"{option} {path} would replace an input file")
+    check_new({option: path}, None, inputs)
 
 
 def _is_same_file(path: Path, other: Path) -> bool:

@@ -18,7 +18,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, count, flag, number, pick, set_default
+from quasiharmonic.ui.cli.arguments import (
+    Commands,
+    add_command,
+    add_options,
+    choice,
+    count,
+    flag,
+    number,
+    pick,
+    set_default,
+)
 from quasiharmonic.util.options import ENERGIES
 
 if TYPE_CHECKING:
@@ -27,7 +37,6 @@ if TYPE_CHECKING:
 
     from quasiharmonic.apps.animation.frames import Animation, FrameStep
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 PICTURES = ".gif", ".mp4"
 

@@ -17,12 +17,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, declared, number, pick, texture_size
+from quasiharmonic.ui.cli.arguments import (
+    Commands,
+    add_command,
+    add_files,
+    add_options,
+    declared,
+    number,
+    pick,
+    texture_size,
+)
 from quasiharmonic.util.options import BakeOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

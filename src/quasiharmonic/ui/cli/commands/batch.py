@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 from quasiharmonic.ui.cli import map_options, process, report
 from quasiharmonic.ui.cli.arguments import (
     SHARED,
+    Commands,
     add_command,
     add_options,
     byte_count,
@@ -45,7 +46,6 @@ from quasiharmonic.util.options import ENERGIES, FLATTENED, DescentOptions, Unwr
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.batch import Progress
-    from quasiharmonic.ui.cli.arguments import Commands
 
 # Options of `unwrap` that are options of a run.
 _OF_RUNS = "jobs", "time_limit"

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, flag, weld
+from quasiharmonic.ui.cli.arguments import Commands, add_command, add_options, choice, file, flag, weld
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from quasiharmonic.problem.diagnosis import Diagnosis
     from quasiharmonic.problem.inspection import MeshReport
     from quasiharmonic.targets import BoundaryLoop
-    from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.ui.cli.pipeline import WrittenMap
 
 # Maximum number of corners per loop.
@@ -208,10 +207,7 @@ def _list_boundary(options: argparse.Namespace) -> int:
         marked = [corner["vertex"] for loop in described for corner in loop["corners"]]
         save_boundary_figure(options.plot, mesh.V, mesh.F, [loop.vertices for loop in loops], np.array(marked))
         text.append(f"wrote {options.plot}")
-    account = pipeline.Account(facts, text)
-    if options.plot is None:
-        return pipeline.conclude(options, account)
-    return pipeline.finish(options, lambda: account, options.plot)
+    return pipeline.conclude(options, pipeline.Account(facts, text), options.plot)
 
 
 def _describe_loop(loop: BoundaryLoop, V: NDArray[np.float64]) -> dict[str, Any]:

@@ -13,12 +13,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli.arguments import add_command
-
-if TYPE_CHECKING:
-    from quasiharmonic.ui.cli.arguments import Commands
+from quasiharmonic.ui.cli.arguments import Commands, add_command
 
 LETTER = "R"
 

@@ -22,7 +22,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, file, flag, number
+from quasiharmonic.ui.cli.arguments import Commands, add_command, add_files, add_options, choice, file, flag, number
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from quasiharmonic.io.fields import DisplacementField
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import map_options, pipeline, process, report
 from quasiharmonic.ui.cli.arguments import (
+    Commands,
     add_command,
     add_files,
     add_options,
@@ -39,7 +40,6 @@ from quasiharmonic.util.options import FlattenOptions
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
 # Distance between pieces, in allowances; with 2 or less the allowances would touch.

@@ -15,14 +15,13 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, declared, flag, number
+from quasiharmonic.ui.cli.arguments import Commands, add_command, add_files, add_options, declared, flag, number
 from quasiharmonic.ui.cli.commands import polish
 from quasiharmonic.util.options import HarmoniseOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.io.seamed_mesh import SeamedMesh
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import map_options, pipeline, process, report
 from quasiharmonic.ui.cli.arguments import (
+    Commands,
     add_command,
     add_files,
     add_options,
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from quasiharmonic.io.seamed_mesh import Island
     from quasiharmonic.problem import Problem
     from quasiharmonic.problem.result import MapResult
-    from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.ui.cli.map_options import IslandProblem
     from quasiharmonic.ui.cli.pipeline import WrittenMap
 

@@ -22,7 +22,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, count, file, flag, number, text
+from quasiharmonic.ui.cli.arguments import (
+    Commands,
+    add_command,
+    add_files,
+    add_options,
+    choice,
+    count,
+    file,
+    flag,
+    number,
+    text,
+)
 from quasiharmonic.ui.cli.finite_elements import MOTIONS, in_order, list_motions, move_groups, read_tetrahedra
 from quasiharmonic.util.options import ENERGIES
 
@@ -30,7 +41,6 @@ if TYPE_CHECKING:
     from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
     from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
     from quasiharmonic.io.fem.files import FemMesh
-    from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.util.arrays import FloatArray, IntArray
 
     # Vertices that move, and the function from the share of the motion to their positions
@@ -105,7 +115,7 @@ def run(options: argparse.Namespace) -> int:
     if options.motions and options.motions[0][0] != "group":
         raise ValueError(f"--{options.motions[0][0]} needs a group: put --group NAME before it")
     inputs = options.input, options.positions, options.rest
-    report.check_moved(options.output, options.json, inputs=inputs)
+    report.check_new({"-o": options.output}, options.json, inputs=inputs)
     check_fem_output(options.output, options.input)
     if options.steps is not None:
         series = dict.fromkeys(map(str, list_series(options.output, options.steps)))

@@ -13,14 +13,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report
-from quasiharmonic.ui.cli.arguments import MEASURES, add_command, add_options, choice, set_default, text
+from quasiharmonic.ui.cli.arguments import MEASURES, Commands, add_command, add_options, choice, set_default, text
 from quasiharmonic.ui.cli.pipeline import CHECKERBOARD
-
-if TYPE_CHECKING:
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

@@ -15,7 +15,17 @@ import argparse
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import map_options, pipeline
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, declared, file, flag, pick, text
+from quasiharmonic.ui.cli.arguments import (
+    Commands,
+    add_command,
+    add_files,
+    add_options,
+    declared,
+    file,
+    flag,
+    pick,
+    text,
+)
 from quasiharmonic.util.options import PolishOptions
 
 if TYPE_CHECKING:
@@ -27,7 +37,6 @@ if TYPE_CHECKING:
     from quasiharmonic.energies.measures import Distortion
     from quasiharmonic.io import MeshData
     from quasiharmonic.io.seamed_mesh import SeamedMesh
-    from quasiharmonic.ui.cli.arguments import Commands
 
     Lower: TypeAlias = Callable[[SeamedMesh, dict[str, Any]], MappedAtlas]
 

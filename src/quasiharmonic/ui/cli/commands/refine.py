@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options
+from quasiharmonic.ui.cli.arguments import Commands, add_command, add_files, add_options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
     from quasiharmonic.problem import Problem
     from quasiharmonic.solver.refine.refining import RefinedProblem
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

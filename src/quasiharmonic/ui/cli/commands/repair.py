@@ -16,11 +16,10 @@ import argparse
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, count, flag, number, pick
+from quasiharmonic.ui.cli.arguments import Commands, add_command, add_files, add_options, count, flag, number, pick
 
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

@@ -14,13 +14,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli.arguments import add_command
+from quasiharmonic.ui.cli.arguments import Commands, add_command
 from quasiharmonic.util.optional import with_extra
-
-if TYPE_CHECKING:
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, set_default
+from quasiharmonic.ui.cli.arguments import Commands, add_command, add_options, choice, file, set_default
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from quasiharmonic.apps.inverse.inverse_map import InverseMap
     from quasiharmonic.apps.inverse.transfer import SurfaceMap
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 _TABLES = ".npy", ".csv", ".txt"
 

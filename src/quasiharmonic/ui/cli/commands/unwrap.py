@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline
 from quasiharmonic.ui.cli.arguments import (
+    Commands,
     add_command,
     add_files,
     add_options,
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from quasiharmonic.apps.baking.bake import BakeResult
     from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStep
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

@@ -13,13 +13,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import report
-from quasiharmonic.ui.cli.arguments import add_command, add_options, file
-
-if TYPE_CHECKING:
-    from quasiharmonic.ui.cli.arguments import Commands
+from quasiharmonic.ui.cli.arguments import Commands, add_command, add_options, file
 
 
 def add_parser(commands: Commands) -> None:
