@@ -222,8 +222,7 @@ def certify_arrays(
     """`certify_tetrahedra` of checked arrays; ``faces`` is the result of `inspect_faces`, if known."""
     signs = ExactSigns(X)
     sign = signs(T)
-    finite = np.asarray(signs.finite[T].all(axis=1)) if len(T) else np.ones(0, dtype=np.bool_)
-    sign[~finite] = 0
+    finite = np.asarray(signs.finite[T].all(axis=1))
     if faces is None:
         faces = inspect_faces(T, len(X))
     clean = len(T) > 0 and not (faces.repeated.size or len(faces.nonmanifold) or len(faces.inconsistent))

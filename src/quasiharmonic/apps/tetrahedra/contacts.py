@@ -161,12 +161,7 @@ def _edge_meets(
         meet[flat] = ~_apart_in_plane(edge[flat], F[flat], X)
     through = np.flatnonzero((p_side * q_side <= 0) & ~flat)
     if through.size:
-        turns = np.stack(
-            [
-                signs(np.concatenate([edge[through], F[through][:, side]], axis=1))
-                for side in (list(side) for side in _SIDES)
-            ]
-        )
+        turns = np.stack([signs(np.concatenate([edge[through], F[through][:, side]], axis=1)) for side in _SIDES])
         meet[through] = np.all(turns >= 0, axis=0) | np.all(turns <= 0, axis=0)
     return meet
 

@@ -86,11 +86,9 @@ class ShapeEnergy:
         self.T, self.n, self.floor = T, len(rest), floor
         u, v, w = (np.ascontiguousarray((rest[T[:, k]] - rest[T[:, 0]]).T) for k in (1, 2, 3))
         volume = dot(u, cross(v, w))
-        # Gradients of the four linear basis functions.
+        # Gradients of the four linear basis functions, and six times the volumes at rest.
         one, two, three = cross(v, w) / volume, cross(w, u) / volume, cross(u, v) / volume
-        self.gradients = np.stack([-(one + two + three), one, two, three])
-        # Six times the volumes at rest.
-        self.volumes = volume
+        self.gradients, self.volumes = np.stack([-(one + two + three), one, two, three]), volume
 
     def jacobians(self, X: FloatArray) -> FloatArray:
         """Return the Jacobian matrices, (3, 3, t)."""
@@ -109,6 +107,10 @@ class ShapeEnergy:
         """Return the determinants (t,) of the Jacobian matrices."""
         J = self.jacobians(X)
         return dot(J[0], cross(J[1], J[2]))
+
+    def count_inverted(self, X: FloatArray) -> int:
+        """Return the number of tetrahedra whose determinant is not positive."""
+        return int(np.count_nonzero(~(self.determinants(X) > 0)))
 
     def value(self, X: FloatArray, epsilon: float) -> float:
         """Return the energy per tetrahedron; infinite if ε is 0 and a tetrahedron is not positive."""
@@ -133,14 +135,12 @@ class ShapeEnergy:
         t = np.einsum("abt,abt->t", J, J)
         chi = regularise(D - self.floor, epsilon)
         root = np.hypot(D - self.floor, epsilon)
-        first = chi / root
-        second = 0.5 * (epsilon / root) ** 2 / root
         a, b = (1 - _VOLUME_SHARE) / 3, _VOLUME_SHARE / 2
         shape = a * np.cbrt(chi) ** -2
         g = b * (D * D + 1) / chi
-        slope = first / chi
-        bend = second / chi
-        by_t_d = -2 / 3 * shape * slope
+        # First and second derivative of χ, relative to χ.
+        slope = chi / root / chi
+        bend = 0.5 * (epsilon / root) ** 2 / root / chi
         by_d_d = (
             shape * t * (10 / 9 * slope**2 - 2 / 3 * bend)
             + 2 * b / chi
@@ -151,23 +151,20 @@ class ShapeEnergy:
             value=shape * t + g,
             by_t=shape,
             by_d=-2 / 3 * shape * t * slope + 2 * b * D / chi - g * slope,
-            by_t_d=by_t_d,
+            by_t_d=-2 / 3 * shape * slope,
             # The least value with positive semidefinite second derivatives in J and D; larger ones are exact.
             by_d_d=np.maximum(by_d_d, 8 / 9 * shape * t * slope**2),
         )
-
-    def gradient(self, X: FloatArray, epsilon: float) -> tuple[float, FloatArray]:
-        """Return the energy per tetrahedron and its gradient (n, 3)."""
-        d, along, across = self._parts(X, epsilon)
-        return float(d.value.mean()), self._sum_forces(d, along, across)
 
     def derivatives(self, X: FloatArray, epsilon: float) -> tuple[float, FloatArray, FloatArray]:
         """Return the energy per tetrahedron, its gradient (n, 3), and blocks of its approximate second derivatives.
 
         The blocks (10, 3, 3, t) belong to the pairs (i, j), i ≤ j, of vertices of every tetrahedron.
         """
-        d, along, across = self._parts(X, epsilon)
-        count, G = len(self.T), self.gradients
+        J, count, G = self.jacobians(X), len(self.T), self.gradients
+        cofactors = np.stack([cross(J[1], J[2]), cross(J[2], J[0]), cross(J[0], J[1])])
+        d = self._density(J, dot(J[0], cofactors[0]), epsilon)
+        along, across = (np.einsum("abt,ibt->iat", matrix, G) for matrix in (J, cofactors))
         blocks = np.empty((len(_PAIRS), 3, 3, count))
         mixed = 2 * d.by_t_d / count * along + 0.5 * d.by_d_d / count * across
         for k, (i, j) in enumerate(_PAIRS):
@@ -177,21 +174,9 @@ class ShapeEnergy:
                     np.multiply(mixed[i, a], across[j, b], out=blocks[k, a, b])
                     blocks[k, a, b] += across[i, a] * mixed[j, b]
                 blocks[k, a, a] += diagonal
-        return float(d.value.mean()), self._sum_forces(d, along, across), blocks
-
-    def _parts(self, X: FloatArray, epsilon: float) -> tuple[_Density, FloatArray, FloatArray]:
-        """The density with its derivatives, and the products of J and its cofactors with the gradients, (4, 3, t)."""
-        J = self.jacobians(X)
-        C = np.stack([cross(J[1], J[2]), cross(J[2], J[0]), cross(J[0], J[1])])
-        d = self._density(J, dot(J[0], C[0]), epsilon)
-        return d, np.einsum("abt,ibt->iat", J, self.gradients), np.einsum("abt,ibt->iat", C, self.gradients)
-
-    def _sum_forces(self, d: _Density, along: FloatArray, across: FloatArray) -> FloatArray:
-        """The gradient (n, 3) of the energy per tetrahedron."""
-        force = (2 * d.by_t * along + d.by_d * across) / len(self.T)
-        return np.stack(
-            [np.bincount(self.T.T.ravel(), force[:, a].ravel(), minlength=self.n) for a in range(3)], axis=1
-        )
+        force, vertex = (2 * d.by_t * along + d.by_d * across) / count, self.T.T.ravel()
+        gradient = [np.bincount(vertex, force[:, a].ravel(), minlength=self.n) for a in range(3)]
+        return float(d.value.mean()), np.stack(gradient, axis=1), blocks
 
 
 class BlockMatrix:

@@ -66,7 +66,9 @@ class ExactSigns:
                 sign[block] = _sign_if_certain(self._edges(corners[block].T))
             undecided = np.flatnonzero(sign == 0)
             if not self.finite.all():
-                undecided = undecided[np.asarray(self.finite[corners[undecided]].all(axis=1))]
+                finite = np.asarray(self.finite[corners].all(axis=1))
+                sign[~finite] = 0
+                undecided = undecided[finite[undecided]]
             for start in range(0, undecided.size, _CHUNK):
                 heartbeat()
                 chunk = undecided[start : start + _CHUNK]
@@ -82,12 +84,7 @@ class ExactSigns:
 def tetrahedron_signs(T: IntArray, X: FloatArray) -> tuple[SignArray, IntArray]:
     """Exact orientations (t,) int8 of tetrahedra, and the ascending indices of those with a non-finite coordinate."""
     signs = ExactSigns(X)
-    sign = signs(T)
-    nonfinite = np.empty(0, dtype=np.int64)
-    if not signs.finite.all():
-        nonfinite = np.flatnonzero(~np.asarray(signs.finite[T].all(axis=1)))
-        sign[nonfinite] = 0
-    return sign, nonfinite
+    return signs(T), np.flatnonzero(~signs.finite[T].all(axis=1))
 
 
 def _sign_if_certain(edges: Sequence[FloatArray]) -> SignArray:
@@ -181,24 +178,18 @@ class FaceReport:
     ----------
     boundary : (b, 3) int64
         Triangles in one tetrahedron only, counterclockwise seen from outside if the tetrahedron is positive.
-    owner : (b,) int64
-        The tetrahedron of each boundary triangle.
     nonmanifold : (k, 3) int64
         Faces of three or more tetrahedra.
     inconsistent : (k, 3) int64
         Faces of two tetrahedra that traverse them in the same direction.
     repeated : (k,) int64
         Tetrahedra with the same four vertices as an earlier one, and those with a vertex twice.
-    neighbours : (m, 2) int64
-        Pairs of tetrahedra with a common face.
     """
 
     boundary: IntArray
-    owner: IntArray
     nonmanifold: IntArray
     inconsistent: IntArray
     repeated: IntArray
-    neighbours: IntArray
 
 
 def inspect_faces(T: IntArray, n: int) -> FaceReport:
@@ -210,10 +201,9 @@ def inspect_faces(T: IntArray, n: int) -> FaceReport:
     alone = np.sort(order[first[size == 1]])
     pair = first[size == 2]
     one, other = order[pair], order[pair + 1]
-    many = order[first[size > 2]]
     opposite = T.ravel()  # face k of a tetrahedron is opposite its vertex k
     twins = opposite[one] == opposite[other]
-    twice = np.flatnonzero((np.sort(T, axis=1)[:, 1:] == np.sort(T, axis=1)[:, :-1]).any(axis=1)) if len(T) else one
+    twice = np.flatnonzero((np.sort(T, axis=1)[:, 1:] == np.sort(T, axis=1)[:, :-1]).any(axis=1))
     crowded = np.unique(order[repeat_each(size > 2, size)] // 4)
     repeated = [np.maximum(one, other)[twins] // 4, twice]
     if crowded.size:
@@ -222,11 +212,9 @@ def inspect_faces(T: IntArray, n: int) -> FaceReport:
         repeated.append(crowded[index[number.ravel()] != np.arange(len(crowded))])
     return FaceReport(
         boundary=faces[alone],
-        owner=alone // 4,
-        nonmanifold=ordered[many],
+        nonmanifold=ordered[order[first[size > 2]]],
         inconsistent=ordered[one[odd[one] == odd[other]]],
         repeated=np.unique(np.concatenate(repeated)),
-        neighbours=np.stack([one // 4, other // 4], axis=1),
     )
 
 
@@ -238,18 +226,20 @@ def _sort_triples(faces: IntArray) -> tuple[IntArray, IntArray]:
     return np.stack([low, a + b + c - low - high, high], axis=1), odd & 1
 
 
-def _group(ordered: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Return an order in which equal rows are adjacent, and the start of each group of equal rows."""
-    if not len(ordered):
+def _group(rows: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Return an order in which equal rows of vertices are adjacent, and the start of each group of equal rows."""
+    if not len(rows):
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     if n <= _MAX_PACKED:
-        key = (ordered[:, 0] * n + ordered[:, 1]) * n + ordered[:, 2]
+        key = rows[:, 0]
+        for column in rows.T[1:]:
+            key = key * n + column
         order = np.argsort(key, kind="stable")
         key = key[order]
         differs = key[1:] != key[:-1]
     else:
-        order = np.lexsort(ordered.T[::-1])
-        rows = ordered[order]
+        order = np.lexsort(rows.T[::-1])
+        rows = rows[order]
         differs = (rows[1:] != rows[:-1]).any(axis=1)
     return order, np.flatnonzero(np.concatenate([[True], differs]))
 
@@ -260,11 +250,8 @@ def find_patches(boundary: IntArray) -> IntArray:
     from scipy.sparse.csgraph import connected_components
 
     edges = np.sort(boundary[:, _EDGES_OF_TRIANGLE].reshape(-1, 2), axis=1)
-    key = edges[:, 0] * (boundary.max(initial=0) + 1) + edges[:, 1]
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-    pair = first[np.diff(np.append(first, len(key))) == 2]
+    order, first = _group(edges, int(boundary.max(initial=0)) + 1)
+    pair = first[np.diff(np.append(first, len(order))) == 2]
     one, other = order[pair] // 3, order[pair + 1] // 3
     graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(len(boundary), len(boundary)))
     labels: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)

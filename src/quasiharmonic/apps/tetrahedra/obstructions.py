@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from quasiharmonic.apps.tetrahedra.contacts import edges_meeting_triangles
-from quasiharmonic.apps.tetrahedra.elements import SignArray, find_mesh_edges
+from quasiharmonic.apps.tetrahedra.elements import FACES, SignArray, find_mesh_edges
 from quasiharmonic.apps.tetrahedra.result import TetrahedraObstruction
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
@@ -99,9 +99,7 @@ def _find_empty_kernel(T: IntArray, X: FloatArray, fixed: BoolArray, vertex: int
 
 def _half_space(points: FloatArray, corner: int) -> tuple[_Vector, Fraction]:
     """The open half-space ``normal · x > offset`` in which a corner of a tetrahedron (4, 3) makes it positive."""
-    p = [[Fraction(value) for value in point] for point in points.tolist()]
-    order = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))[corner]
-    a, b, c = (p[k] for k in order)
+    a, b, c = ([Fraction(value) for value in point] for point in points[FACES[corner]].tolist())
     u, v = ([y - x for x, y in zip(a, end, strict=True)] for end in (b, c))
     # The face is counterclockwise seen from outside, so its normal is turned inwards.
     normal = [-(u[1] * v[2] - u[2] * v[1]), -(u[2] * v[0] - u[0] * v[2]), -(u[0] * v[1] - u[1] * v[0])]

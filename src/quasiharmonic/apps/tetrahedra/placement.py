@@ -234,7 +234,7 @@ def _search(descent: TetrahedraDescent, options: TetrahedraOptions) -> tuple[Flo
     best = [(len(energy.T) + 1, X)]
     run = Run(options.callback)
     with run.until_interrupted(), np.errstate(all="ignore"):
-        count = int(np.count_nonzero(~(energy.determinants(X) > 0)))
+        count = energy.count_inverted(X)
         best[:] = [(count, X)]
         run.record(count, np.inf)
         if count and descent.free.size:
@@ -255,7 +255,7 @@ def _untangle(
     energy = descent.energy
     since, least = 0, float(energy.determinants(descent.X).min())
     for now in descent.untangle(options.max_iterations):
-        count = int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
+        count = energy.count_inverted(descent.X)
         since += 1
         if count < best[-1][0] or now > least + 0.05 * abs(least):
             since, least = 0, max(now, least)
@@ -264,7 +264,7 @@ def _untangle(
         run.record(count, np.inf)
         if since >= _PATIENCE:
             break
-    return int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
+    return energy.count_inverted(descent.X)
 
 
 def _polish(descent: TetrahedraDescent, options: TetrahedraOptions, run: Run) -> TetrahedraStatus:

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quasiharmonic.apps.tetrahedra.certificate import TetrahedraCertificate
+from quasiharmonic.apps.tetrahedra.elements import EDGES
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
 from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Outcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_SIDES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
 class TetrahedraStatus(Enum):
@@ -190,6 +189,6 @@ def tetrahedron_quality(T: IntArray, X: FloatArray) -> FloatArray:
     p /= np.where(size > 0, size, 1.0)[:, None, None]
     u, v, w = p[:, 1], p[:, 2], p[:, 3]
     volume = (u * np.cross(v, w)).sum(axis=1) / 6
-    squares = sum(((p[:, i] - p[:, j]) ** 2).sum(axis=1) for i, j in _SIDES)
+    squares = sum(((p[:, i] - p[:, j]) ** 2).sum(axis=1) for i, j in EDGES)
     ratio = 12 * np.cbrt(3 * np.abs(volume)) ** 2 / np.where(squares > 0, squares, 1.0)
     return np.asarray(np.sign(volume) * ratio)

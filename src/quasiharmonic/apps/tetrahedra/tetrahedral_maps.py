@@ -121,30 +121,26 @@ def morph_tetrahedra(
     points = space_array("points", points, finite=False)
     first = points if rest is None else space_array("rest", rest, len(points), finite=False)
     mesh = check_rest(T, first)
-    moved = find_moved(mesh, len(points), moved_vertices)
+    moved, still, sliding = find_fixed(mesh, points, moved_vertices, options.slide)
     goal = space_array("target", target, moved.size)
-    sliding = find_sliding(mesh.faces.boundary, points, moved, options.slide)
-    still = find_still(mesh, moved, sliding)
     begin = (None if rest is None else points) if start is None else space_array("start", start, len(points))
     fixed, goal = np.concatenate([moved, still]), np.concatenate([goal, points[still]])
     return place_vertices(mesh, points, fixed, goal, begin, checked, sliding)
 
 
-def find_moved(mesh: RestMesh, n: int, moved_vertices: ArrayLike) -> IntArray:
-    """Check the moved vertices of a mesh of ``n`` vertices."""
-    moved = vertex_indices("moved_vertices", moved_vertices, n)
+def find_fixed(
+    mesh: RestMesh, points: FloatArray, moved_vertices: ArrayLike, slide: bool | ArrayLike
+) -> tuple[IntArray, IntArray, Sliding]:
+    """Return the moved vertices, checked, the boundary vertices that neither move nor slide, and those that slide."""
+    moved = vertex_indices("moved_vertices", moved_vertices, len(points))
     times = np.bincount(moved, minlength=1)
     if times.max() > 1:
         raise ValueError(f"{names_of('vertex', 'vertices', np.flatnonzero(times > 1))} moved more than once")
     idle = moved[~np.isin(moved, mesh.T)]
     if idle.size:
         raise ValueError(f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, in no tetrahedron")
-    return moved
-
-
-def find_still(mesh: RestMesh, moved: IntArray, sliding: Sliding) -> IntArray:
-    """Return the boundary vertices that neither move nor slide."""
-    return np.setdiff1d(mesh.boundary_vertices, np.concatenate([moved, sliding.vertices]))
+    sliding = find_sliding(mesh.faces.boundary, points, moved, slide)
+    return moved, np.setdiff1d(mesh.boundary_vertices, np.concatenate([moved, sliding.vertices])), sliding
 
 
 class MovingTetrahedra:
@@ -161,9 +157,8 @@ class MovingTetrahedra:
         self.points = space_array("points", points)
         self._mesh = check_rest(T, self.points)
         self._settle = settle
-        self._moved = find_moved(self._mesh, len(self.points), moved_vertices)
-        sliding = find_sliding(self._mesh.faces.boundary, self.points, self._moved, slide)
-        self._fixed = np.concatenate([self._moved, find_still(self._mesh, self._moved, sliding)])
+        self._moved, still, sliding = find_fixed(self._mesh, self.points, moved_vertices, slide)
+        self._fixed = np.concatenate([self._moved, still])
         self._free = np.setdiff1d(np.unique(self._mesh.T), self._fixed)
         self._projections = sliding.restrict(self._free)
         self._energy, scaled, self._exponent = make_energy(self._mesh, self.points, False)
