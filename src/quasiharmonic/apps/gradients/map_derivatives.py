@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TypedDict, Unpack, get_args
+from typing import Any, TypedDict, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +29,7 @@ from quasiharmonic.energies.energies import Energy, QuadraticForm
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.sliding_boundary import move_boundary
 from quasiharmonic.energies.polishing import check_injective, find_energy, scale_energy
-from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves, Track
+from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
@@ -119,8 +119,8 @@ def quasi_harmonic_derivative(
     return Derivative(uv, equilibrium, [Doubt.CLIPPED] if clipped.any() else [])
 
 
-#: Error message for maps that are not injective.
-NOT_FOUND = "no map was found, so there is no derivative"
+# Error message for maps that are not injective.
+_NOT_FOUND = "no map was found, so there is no derivative"
 
 
 class PolishDerivativeKeywords(TypedDict, total=False):
@@ -191,15 +191,15 @@ def differentiate_polish(domain: Domain, uv: ArrayLike, options: PolishOptions) 
     """Converge a polished map to rounding, and differentiate it; see `polish_derivative`."""
     domain.check_boundary_fixed()
     chosen = find_energy(options.energy)
-    start = check_injective(domain, uv, NOT_FOUND)
+    start = check_injective(domain, uv, _NOT_FOUND)
     track = move_boundary(options.slide, domain, start) if options.slide is not False else None
     if track is not None:
         start = track.uv
     counts = None if options.weights is None else positive_weights(options.weights, len(domain.F))
     measure, exponent = scale_energy(domain, start, chosen, counts)
     w = in_units(start, exponent)
-    strain = make_strain(domain)
-    by_rest = differentiate_surface_size(strain)
+    strain = _make_strain(domain)
+    by_rest = _differentiate_surface_size(strain)
     if track is None:
         freedom = Freedom(measure, domain.n, domain.fixed, options.linear_solver)
         scale = Scale(-differentiate_map_size(w, domain.loops), by_rest)
@@ -207,27 +207,35 @@ def differentiate_polish(domain: Domain, uv: ArrayLike, options: PolishOptions) 
         freedom = SlidingFreedom(measure, track, domain, exponent, options.linear_solver)
         scale = Scale(np.zeros_like(w), by_rest)
     minimum = Minimum(measure, w, freedom)
-    equilibrium = Equilibrium(
+    placed = _place_map(minimum.w, exponent, np.setdiff1d(domain.fixed, freedom.sliding), start)
+    # Curves determine the positions of the vertices that slide, and of those at corners.
+    on_curves = None if track is None else np.concatenate([chain.vertices for chain in track.chains])
+    equilibrium = _make_equilibrium(domain, minimum, strain, exponent, on_curves=on_curves, scale=scale)
+    return Derivative(placed, equilibrium, minimum.doubts)
+
+
+def _make_equilibrium(
+    domain: Domain, minimum: Minimum, strain: RestStrain, exponent: int, **further: Any
+) -> Equilibrium:
+    """Return the equilibrium at a minimum in units of ``2 ** exponent``; ``further`` are other attributes."""
+    return Equilibrium(
         fixed=domain.fixed,
         forces=minimum.forces,
         inverse=minimum.solve,
         make_strain=lambda: strain,
         rest_shape=domain.V.shape,
         unit=2.0**exponent,
-        on_curves=None if track is None else find_curve_vertices(track),
-        scale=scale,
+        **further,
     )
-    held = np.setdiff1d(domain.fixed, freedom.sliding)
-    return Derivative(place_map(minimum.w, exponent, held, start), equilibrium, minimum.doubts)
 
 
-def make_strain(domain: Domain) -> RestStrain:
+def _make_strain(domain: Domain) -> RestStrain:
     """The change of triangles with the rest positions; planar triangles are taken as counterclockwise."""
     domain.check_areas()
     return RestStrain(domain.V, domain.F, signed=False)
 
 
-def differentiate_surface_size(strain: RestStrain) -> FloatArray:
+def _differentiate_surface_size(strain: RestStrain) -> FloatArray:
     """The derivative (n, d) of half the logarithm of the surface's area with respect to the rest positions."""
     # The largest area may be near the largest double.
     relative = strain.m / strain.m.max()
@@ -235,12 +243,7 @@ def differentiate_surface_size(strain: RestStrain) -> FloatArray:
     return strain.pull(share, np.zeros_like(share))
 
 
-def find_curve_vertices(track: Track) -> IntArray:
-    """Vertices whose positions the curves determine: those that slide, and those at corners."""
-    return np.concatenate([chain.vertices for chain in track.chains])
-
-
-def place_map(w: ComplexArray, exponent: int, fixed: IntArray, given: FloatArray) -> FloatArray:
+def _place_map(w: ComplexArray, exponent: int, fixed: IntArray, given: FloatArray) -> FloatArray:
     """Scale a map out of its units, with fixed vertices exactly at their given positions."""
     uv: FloatArray = np.ldexp(to_points(w), exponent)
     uv[fixed] = given[fixed]
@@ -308,8 +311,8 @@ def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: 
     """Converge a flattened map to rounding, and differentiate it; see `flatten_derivative`."""
     domain = Domain(V, F, () if options.fixed is None else options.fixed)
     chosen = find_energy(options.energy)
-    start = check_injective(domain, uv, NOT_FOUND)
-    strain = make_strain(domain)
+    start = check_injective(domain, uv, _NOT_FOUND)
+    strain = _make_strain(domain)
     exponent = find_exponent(domain.V)
     w = in_units(start, exponent)
     measure = DeformationEnergy(
@@ -337,19 +340,11 @@ def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: 
         minimum, doubts = find_minimum(w, converge=False), [Doubt.CONTACT]
     scale = None
     if gauge is not None and gauge.keeps_area:
-        scale = Scale(np.zeros_like(w), differentiate_surface_size(strain))
-    equilibrium = Equilibrium(
-        fixed=domain.fixed,
-        forces=minimum.forces,
-        inverse=minimum.solve,
-        make_strain=lambda: strain,
-        rest_shape=domain.V.shape,
-        unit=2.0**exponent,
-        scale=scale,
-        gauge=None if gauge is None else replace(gauge, w=minimum.w),
-    )
-    uv = place_map(minimum.w, exponent, domain.fixed, start)
-    return Derivative(uv, equilibrium, [*doubts, *minimum.doubts])
+        scale = Scale(np.zeros_like(w), _differentiate_surface_size(strain))
+    gauge = None if gauge is None else replace(gauge, w=minimum.w)
+    equilibrium = _make_equilibrium(domain, minimum, strain, exponent, scale=scale, gauge=gauge)
+    placed = _place_map(minimum.w, exponent, domain.fixed, start)
+    return Derivative(placed, equilibrium, [*doubts, *minimum.doubts])
 
 
 def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge | None:

@@ -7,7 +7,6 @@ is not positive definite, only as much of the negative curvature of triangles is
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from threading import Lock
 from typing import Any
 
@@ -80,12 +79,15 @@ class Minimum:
 
     def solve(self, load: ComplexArray) -> ComplexArray:
         """Return the displacement (n,) of the vertices under a load (n,) on them."""
-        freedom = self._freedom
-        on_unknowns = freedom.gather(load)
+        return self._freedom.spread(self._solve_unknowns(self._freedom.gather(load)))
+
+    def _solve_unknowns(self, load: ComplexArray) -> ComplexArray:
+        """Return the change of the unknowns under a load on them."""
         if self._lu is None:
-            return freedom.spread(freedom.system.solve(on_unknowns))
+            return self._freedom.system.solve(load)
         with self._lock:
-            return freedom.spread(self._lu.solve(on_unknowns.view(np.float64)).view(np.complex128))
+            answer: ComplexArray = self._lu.solve(load.view(np.float64)).view(np.complex128)
+            return answer
 
     def _converge(self, steps: int) -> float:
         """Take steps until converged, leave the system factored, and return the strain of the step not taken."""
@@ -213,16 +215,12 @@ class Minimum:
         if not system.free.size:
             return 1.0
         scale = np.sqrt(np.abs(system.diagonal))
-        solve: Callable[[ComplexArray], ComplexArray] = system.solve
-        if self._lu is not None:
-            lu = self._lu
-            solve = lambda load: lu.solve(load.view(np.float64)).view(np.complex128)  # noqa: E731
         x = np.random.default_rng(0).standard_normal(scale.size)
         growth = 0.0
         for _ in range(_POWER_ITERATIONS):
             x *= scale / np.linalg.norm(x)
             try:
-                x = scale * solve(x.view(np.complex128)).view(np.float64)
+                x = scale * self._solve_unknowns(x.view(np.complex128)).view(np.float64)
             except NotPositiveDefinite:
                 return 0.0
             growth = float(np.linalg.norm(x))
