@@ -23,7 +23,7 @@ from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.models.textures import MaterialTextures
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, describe
 from quasiharmonic.util.options import BakeOptions, takes
-from quasiharmonic.util.outcome import BaseOutcome
+from quasiharmonic.util.outcome import BaseOutcome, as_plain
 
 #: Colour of texels that are too far from the old model, 8-bit sRGB.
 MISSING = (255, 0, 255)
@@ -112,16 +112,12 @@ class BakeResult(BaseOutcome):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report for JSON, without the images."""
+        height, width = self.colour.shape[:2]
         return {
-            "success": self.success,
-            "message": self.message,
-            "size": [self.colour.shape[1], self.colour.shape[0]],
-            "metallic_roughness": self.metallic_roughness is not None,
-            "normal": self.normal is not None,
-            "emission": self.emission is not None,
-            "covered": self.covered,
-            "missing": self.missing,
-            "same_mesh": self.same_mesh,
+            **as_plain(self, "success", "message"),
+            "size": [width, height],
+            **{name: getattr(self, name) is not None for name in ("metallic_roughness", "normal", "emission")},
+            **as_plain(self, "covered", "missing", "same_mesh"),
             "problems": list(self.problems),
             "seconds": self.seconds,
         }

@@ -45,7 +45,7 @@ from quasiharmonic.util.arrays import (
     names_of,
     real_array,
 )
-from quasiharmonic.util.outcome import Verdict
+from quasiharmonic.util.outcome import Verdict, as_plain
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -159,15 +159,10 @@ class TetrahedraCertificate(ReadOnly, Verdict):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the certificate in plain Python types, fit for JSON; boundary triangles by their vertices."""
+        elements = "inverted", "degenerate", "nonfinite", "repeated", "nonmanifold", "inconsistent"
         return {
             **super().to_dict(),
-            "injective": self.injective,
-            "positive": self.positive,
-            "tetrahedra": self.tetrahedra,
-            **{
-                name: getattr(self, name).tolist()
-                for name in ("inverted", "degenerate", "nonfinite", "repeated", "nonmanifold", "inconsistent")
-            },
+            **as_plain(self, "injective", "positive", "tetrahedra", *elements),
             "boundary_triangles": len(self.boundary),
             "crossings": self.boundary[self.crossings].tolist(),
             "multiply_covered": self.boundary[self.multiply_covered].tolist(),

@@ -12,11 +12,11 @@ from quasiharmonic.apps.tetrahedra.certificate import certify_arrays, find_bound
 from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED
 from quasiharmonic.apps.tetrahedra.descent import ShapeEnergy, TetrahedraDescent
 from quasiharmonic.apps.tetrahedra.elements import FaceReport, inspect_faces, tetrahedron_signs
-from quasiharmonic.apps.tetrahedra.obstructions import find_obstructions
 from quasiharmonic.apps.tetrahedra.result import (
     TetrahedraObstruction,
     TetrahedraResult,
     TetrahedraStatus,
+    find_obstructions,
     tetrahedron_quality,
 )
 from quasiharmonic.apps.tetrahedra.sliding import NO_SLIDING, Sliding, project

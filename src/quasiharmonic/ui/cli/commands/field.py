@@ -71,6 +71,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.apps.displacement_fields.nearest import InvertibleField, fold_free, nearest_invertible
     from quasiharmonic.apps.displacement_fields.voxels import describe_fixed
     from quasiharmonic.io.fields import field_suffix, read_field
+    from quasiharmonic.util.outcome import as_plain
 
     report.check_new({"-o": options.output, "--inverse": options.inverse}, options.json, inputs=(options.input,))
     outputs = [path for path in (options.output, options.inverse) if path is not None]
@@ -94,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
     if options.interpolation != "linear":
         _check_interpolation(repaired.field, spacing, options.interpolation)
     given.write(options.output, repaired.field)
-    invertible = bool(repaired.certificate.bijective if isinstance(repaired, InvertibleField) else repaired.bijective)
+    invertible = bool(repaired.certificate.bijective)
 
     def describe() -> pipeline.Account:
         # Rotation to the axes of space rounds, so the file is verified.
@@ -105,10 +106,7 @@ def run(options: argparse.Namespace) -> int:
             "injective": repaired.success,
             "bijective": invertible,
             "moved": int(repaired.moved_mask.sum()),
-            "folds": repaired.folds,
-            "patches": repaired.patches,
-            "distance": repaired.distance,
-            "seconds": repaired.seconds,
+            **as_plain(repaired, "folds", "patches", "distance", "seconds"),
             **pipeline.name_files(options),
         }
         lines = [f"wrote {options.output}: {repaired.summary()}"]
