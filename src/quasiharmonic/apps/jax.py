@@ -60,14 +60,14 @@ def apply_layer(make: Callable[..., Layer], settings: tuple[Any, ...], arguments
     most = max(axes, default=0)
     single = bool(given) and all(array.dtype in _SINGLE for array in given)
     arrays = (
-        jnp.expand_dims(jnp.asarray(array, dtype=_widest(name)), tuple(range(most - own)))
+        jnp.expand_dims(jnp.asarray(array, dtype=_find_dtype(name)), tuple(range(most - own)))
         for name, array, own in zip(names, given, axes, strict=True)
     )
     maps: jax.Array = _map(layer, names, *arrays)
     return maps.astype(np.float32) if single else maps
 
 
-def _widest(name: str) -> np.dtype[Any]:
+def _find_dtype(name: str) -> np.dtype[Any]:
     """The type in which JAX passes an argument or ``"uv"``: double precision if enabled."""
     found: np.dtype[Any] = jax.dtypes.canonicalize_dtype(np.complex128 if name == "mu" else np.float64)
     return found
@@ -87,7 +87,7 @@ class _Call:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _map(layer: Layer, names: tuple[str, ...], *arrays: jax.Array) -> jax.Array:
-    shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.map_shape), _widest("uv"))
+    shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.map_shape), _find_dtype("uv"))
     maps: jax.Array = jax.pure_callback(_Call(_compute, layer, names), shape, *arrays, vmap_method="expand_dims")
     return maps
 
@@ -123,7 +123,7 @@ def _compute(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
     """Compute the maps, and cache their derivatives."""
     given = _by_name(names, arrays)
     exact, derivatives = compute_maps(layer, given)
-    uv = exact.astype(_widest("uv"))
+    uv = exact.astype(_find_dtype("uv"))
     with _lock:
         for item, derivative in zip(np.ndindex(uv.shape[:-2]), derivatives, strict=True):
             _recent[_key(layer, layer.item(given, item), uv[item].astype(np.float64))] = derivative
@@ -146,7 +146,7 @@ def _pull_back(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *a
         derivatives.append(derivative or layer.derivative(own, uv[item]))
     found = compute_gradients(layer, derivatives, cotangent, names)
     # JAX's convention is ∂/∂Re − i ∂/∂Im.
-    return [found[name].conj().astype(_widest(name)) for name in names]
+    return [found[name].conj().astype(_find_dtype(name)) for name in names]
 
 
 def _by_name(names: tuple[str, ...], arrays: tuple[Any, ...]) -> dict[str, Array]:

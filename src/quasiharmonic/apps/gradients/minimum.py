@@ -25,8 +25,6 @@ from quasiharmonic.util.progress import heartbeat
 
 # Maximum number of steps.
 _MAX_STEPS = 100
-# Maximum number of lengths of one step.
-_MAX_HALVINGS = 40
 # If the matrix is not positive definite, these fractions of the triangles' negative curvature are removed in turn.
 _CLAMPED = 1 / 64, 1 / 16, 1 / 4, 1.0
 # Steps with a strain of at most this on every triangle count as zero.
@@ -41,8 +39,6 @@ _REUSE_STRAIN = 1e-8
 _ROUNDING = 1e-13
 # With a unit diagonal, an eigenvalue below this counts as zero.
 _SINGULAR = 1e-10
-# Number of power iterations.
-_POWER_ITERATIONS = 2
 # A triangle whose ratio of smaller to larger singular value is below this counts as nearly collapsed.
 _COLLAPSED_RATIO = 1e-8
 
@@ -141,7 +137,7 @@ class Minimum:
         """Take the longest acceptable part of a step; return False if there is none."""
         before = self._energy.value_of(self._deformation) + self._freedom.extra()
 
-        def trial(t: float, bound: float) -> tuple[float, ComplexArray | None]:
+        def evaluate_step(t: float, bound: float) -> tuple[float, ComplexArray | None]:
             there = self._freedom.advance(self.w, t * step)
             if there is None:
                 return np.inf, None
@@ -150,7 +146,7 @@ class Minimum:
             return value, there if accepted else None
 
         # Near the stationary point only rounding changes the energy, so no decrease is required.
-        taken = backtrack(trial, before + _ROUNDING * abs(before), 0.0, tries=_MAX_HALVINGS)
+        taken = backtrack(evaluate_step, before + _ROUNDING * abs(before), 0.0, tries=40)
         if taken is None:
             return False
         self.w = taken.state
@@ -217,7 +213,7 @@ class Minimum:
         scale = np.sqrt(np.abs(system.diagonal))
         x = np.random.default_rng(0).standard_normal(scale.size)
         growth = 0.0
-        for _ in range(_POWER_ITERATIONS):
+        for _ in range(2):
             x *= scale / np.linalg.norm(x)
             try:
                 x = scale * self._solve_unknowns(x.view(np.complex128)).view(np.float64)

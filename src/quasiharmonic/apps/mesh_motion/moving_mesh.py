@@ -59,8 +59,6 @@ _FRACTION = 0.8
 _MIN_STEP = 1e-4
 # Minimum decrease, relative to the energy, that a step must predict.
 _TOLERANCE = 1e-4
-# Maximum number of steps that move the boundary.
-_MAX_STEPS = 25
 
 
 class MovingDescent:
@@ -112,7 +110,7 @@ class MovingDescent:
             return 0.0
         displacement[system.free] = found[0]
 
-        def trial(t: float, bound: float) -> tuple[float, Coordinates | None]:
+        def evaluate_step(t: float, bound: float) -> tuple[float, Coordinates | None]:
             w = start.w + t * displacement
             there = out_of_units(w[coordinates.fixed], coordinates.exponent)
             moved = coordinates.with_pinned(target if t == 1 else there)
@@ -122,7 +120,7 @@ class MovingDescent:
         if not longest >= _MIN_STEP:
             return 0.0
         tries = 1 + int(np.log2(longest / _MIN_STEP))
-        taken = backtrack(trial, 0.0, 0.0, longest=longest, tries=tries)
+        taken = backtrack(evaluate_step, 0.0, 0.0, longest=longest, tries=tries)
         if taken is None:
             return 0.0
         model.coordinates = taken.state
@@ -293,7 +291,7 @@ class MovingMesh:
         try:
             # Overflow gives inf or NaN, and a step with either is never accepted.
             with np.errstate(all="ignore"):
-                share = self._descent.move(goal, _TOLERANCE, _MAX_STEPS)
+                share = self._descent.move(goal, _TOLERANCE, steps=25)
             if share < 1:
                 raise RuntimeError(
                     f"the boundary can be moved only {share:.1%} of the way: then triangles become too small for such "

@@ -236,10 +236,6 @@ _MAX_CONJUGATE_STEPS = 250
 # The regularisation parameter is kept after a step that lowers the energy by more than this share, but not more often.
 _QUICK_DECREASE = 0.1
 _MAX_REPEATED = 10
-# Step lengths that a line search tries.
-_TRIES = 30
-# First and least regularisation parameter; determinants are about 1.
-_FIRST_EPSILON = 1.0
 _MIN_EPSILON = 1e-14
 
 
@@ -266,7 +262,8 @@ class TetrahedraDescent:
 
     def untangle(self, max_steps: int) -> Iterator[float]:
         """Lower the regularised energy; yield the least determinant after each step, and end when it is positive."""
-        epsilon, repeated = _FIRST_EPSILON, 0
+        # Determinants are about 1.
+        epsilon, repeated = 1.0, 0
         for _ in range(max_steps):
             before = self._value(self.X, epsilon)
             after = self._step(epsilon)
@@ -334,13 +331,13 @@ class TetrahedraDescent:
             return None
         direction = p.reshape(-1, 3)
 
-        def trial(t: float, bound: float) -> tuple[float, FloatArray | None]:
+        def evaluate_step(t: float, bound: float) -> tuple[float, FloatArray | None]:
             X = self.X.copy()
             X[self.free] += t * direction
             found = self._value(X, epsilon)
             return found, X if found < bound else None
 
-        accepted = backtrack(trial, value, decrease, tries=_TRIES)
+        accepted = backtrack(evaluate_step, value, decrease, tries=30)
         if accepted is None:
             return None
         self.X = accepted.state

@@ -25,9 +25,6 @@ from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, name
 from quasiharmonic.util.options import MorphOptions, TetrahedraOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
-# Maximum number of Newton steps to untangle the mesh after one move.
-_MAX_STEPS = 200
-
 
 class TetrahedraKeywords(TypedDict, total=False):
     """Types of the options of `injective_tetrahedra`."""
@@ -181,8 +178,8 @@ class MovingTetrahedra:
         with np.errstate(all="ignore"):
             descent.X = extend_harmonically(self._energy, before, self._fixed, places, self._projections)
             descent.X[self._fixed] = places
-            if descent.make_valid(_MAX_STEPS):
-                for _ in descent.polish(self._settle, 1e-8):
+            if descent.make_valid(max_steps=200):
+                for _ in descent.polish(self._settle, tol=1e-8):
                     pass
         points = self.points.copy()
         points[self._moved] = goal

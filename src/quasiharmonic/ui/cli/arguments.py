@@ -64,7 +64,7 @@ def number(kind: Callable[[str], Any], words: str, *, metavar: str | tuple[str, 
     return {"type": kind, "metavar": metavar, "help": words, **rest}
 
 
-def declared(operation: type[Options]) -> dict[str, Option]:
+def declare_options(operation: type[Options]) -> dict[str, Option]:
     """Return the options of an operation: the fields that its class itself declares with a help text, in their order.
 
     Options of base classes are shared, and commands list these last.
@@ -155,7 +155,7 @@ def byte_count(text: str) -> int:
     return int(value)
 
 
-def welding(text: str) -> bool | float:
+def convert_welding(text: str) -> bool | float:
     """Convert yes, no or a distance; for argparse."""
     if text in ("yes", "no"):
         return text == "yes"
@@ -175,7 +175,7 @@ def weld(default: str) -> Option:
         "weld vertices: yes, at equal positions; no; or a distance relative to the diagonal of the bounding box, such "
         "as 1e-6 (default: %(default)s)"
     )
-    return number(welding, words, metavar="WHICH", default=default)
+    return number(convert_welding, words, metavar="WHICH", default=default)
 
 
 def degrees(text: str) -> float:
@@ -193,8 +193,8 @@ def _island_list(text: str) -> list[int]:
 
 #: The options that several commands take with the same meaning.
 SHARED: dict[str, Option] = {
-    **declared(options.SolverOptions),
-    **declared(options.MapOptions),
+    **declare_options(options.SolverOptions),
+    **declare_options(options.MapOptions),
     "fixed": file("file of fixed vertices, 0-based, one per line (default: the boundary)"),
     "font": text("FONT", "for letters and words: a font file or the name of a font"),
     "corners": text(

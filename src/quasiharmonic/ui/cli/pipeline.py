@@ -267,7 +267,7 @@ def _check_companions(options: argparse.Namespace, companions: tuple[Path, ...])
 
 
 @contextmanager
-def working(source: Path, words: Callable[[Any], str] = process.describe_step) -> Iterator[Any]:
+def show_work(source: Path, words: Callable[[Any], str] = process.describe_step) -> Iterator[Any]:
     """Show progress during the block, and name the source in its errors; yield a callback, or None."""
     with report.name_source(source), process.progress_line(words) as show:
         yield show

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 NO_READER = 141
 #: Seconds between two lines of progress where standard error is not a terminal.
 LOG = 10.0
-_INTERVAL = 0.1
 
 
 def tell(text: str) -> None:
@@ -91,7 +90,7 @@ def overwrite(text: str) -> None:
 
 @contextmanager
 def progress_line(
-    words: Callable[[Any], str] = describe_step, *, live: float = _INTERVAL
+    words: Callable[[Any], str] = describe_step, *, live: float = 0.1
 ) -> Iterator[Callable[[Any], None] | None]:
     """Yield a callback that shows steps every ``live`` seconds.
 
@@ -120,8 +119,6 @@ def progress_line(
 
 
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-# Seconds after which a lost interrupt is repeated.
-_RETRY_SECONDS = 0.01
 
 
 class Interrupts:
@@ -165,7 +162,7 @@ class Interrupts:
 
     def _unraisable(self, lost: UnraisableHookArgs) -> None:
         if isinstance(lost.exc_value, KeyboardInterrupt):
-            again = threading.Timer(_RETRY_SECONDS, _interrupt_main, [self._last])
+            again = threading.Timer(0.01, _interrupt_main, [self._last])
             again.daemon = True
             again.start()
         else:

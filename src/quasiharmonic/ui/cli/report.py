@@ -59,16 +59,16 @@ def in_options(text: str) -> str:
     if not options:
         return text
 
-    def assigned(found: re.Match[str]) -> str:
+    def replace_assigned(found: re.Match[str]) -> str:
         if found[1] not in options:
             return found[0]
         value = found[2].strip("'")
         return options[found[1]] if value in ("True", "False") else f"{options[found[1]]} {value}"
 
-    def listed(found: re.Match[str]) -> str:
+    def replace_listed(found: re.Match[str]) -> str:
         return f"{found[1]} " + re.sub(r"[a-z_]+", lambda name: options.get(name[0], name[0]), found[2])
 
-    text = _LISTED.sub(listed, _ASSIGNED.sub(assigned, text))
+    text = _LISTED.sub(replace_listed, _ASSIGNED.sub(replace_assigned, text))
     return _NAME.sub(lambda found: options.get(found[0], found[0]), text)
 
 

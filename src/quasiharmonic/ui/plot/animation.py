@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.io.adapters.accepts_mesh import writer_accepts_mesh
 from quasiharmonic.io.errors import check_path
-from quasiharmonic.ui.plot.canvas import AS_DRAWN, as_mesh, new_figure, not_positive, paint_map, verdict, view
+from quasiharmonic.ui.plot.canvas import AS_DRAWN, as_mesh, find_not_positive, new_figure, paint_map, verdict, view
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_sequence, map_array
 from quasiharmonic.util.optional import explain_missing
 
@@ -129,7 +129,7 @@ def _figures(
     for name, place in maps:
         figure = new_figure((6, 6))
         ax = figure.add_axes((0.02, 0.02, 0.96, 0.88))
-        inverted = not_positive(F, place)
+        inverted = find_not_positive(F, place)
         paint_map(ax, F, place, color, inverted, fixed, window)
         verdict(ax, name, len(inverted))
         yield figure

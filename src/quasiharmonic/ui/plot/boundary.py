@@ -43,8 +43,6 @@ from quasiharmonic.util.arrays import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Side of the figure in inches.
-_INCHES = 10.0
 # Size of the numbers in points.
 _FONT_SIZE = 7.5
 # Width of a digit, in units of the font size.
@@ -86,7 +84,7 @@ def save_boundary_figure(
     seen, marked = view(rest, F), index_array("corners", corners)
     loops = loop_arrays(loops, len(rest))
     check_range("corners", marked, len(rest))
-    figure = new_figure((_INCHES, _INCHES))
+    figure = new_figure((10, 10))
     ax = figure.add_axes((0.04, 0.02, 0.92, 0.9))
     # Pale colours keep the numbers readable.
     paint_surface(ax, seen, F, 0.4 * seen.color + 0.6)

@@ -77,7 +77,7 @@ def view(V: FloatArray, F: NDArray[np.int64]) -> View:
         depth=seen[:, 2],
         inside=facing[:, 2] < 0,
         light=light,
-        color=lit(hue, light),
+        color=shade(hue, light),
     )
 
 
@@ -133,7 +133,7 @@ def _frame(area: FloatArray, total: float) -> FloatArray:
     return np.asarray(from_above @ from_side @ frame)
 
 
-def lit(hue: FloatArray, light: FloatArray) -> FloatArray:
+def shade(hue: FloatArray, light: FloatArray) -> FloatArray:
     """Darken colours (k, 3) turned away from the light and whiten those that face it; ``light`` (k,) is −1 to 1."""
     strength = ((1 + light) / 2)[:, None]  # never black, because a map also shows unlit triangles
     shade = 0.15 + 0.95 * np.minimum(strength / 0.8, 1)
@@ -308,7 +308,7 @@ def png_bytes(figure: Figure, **options: Any) -> bytes:
     return file.getvalue()
 
 
-def not_positive(F: IntArray, uv: FloatArray) -> IntArray:
+def find_not_positive(F: IntArray, uv: FloatArray) -> IntArray:
     """Return the indices of triangles whose signed area, in floating point, is not positive."""
     uv = scale_for_drawing(uv)
     a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]

@@ -16,12 +16,12 @@ from quasiharmonic.ui.plot.canvas import (
     RED,
     as_mesh,
     caption,
-    lit,
     name_axes,
     new_figure,
     paint_map,
     paint_surface,
     save_picture,
+    shade,
     view,
 )
 from quasiharmonic.util.arrays import FloatArray, check_choice, map_array
@@ -117,7 +117,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     seen = view(rest, F)
     tinted = color.copy()
     tinted[found.inverted] = RED
-    paint_surface(surface, seen, F, lit(tinted, seen.light))
+    paint_surface(surface, seen, F, shade(tinted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
     paint_map(plane, F, uv, color, found.inverted)
     many = len(found.inverted)

@@ -13,8 +13,8 @@ from quasiharmonic.ui.plot.canvas import (
     View,
     as_mesh,
     caption,
+    find_not_positive,
     new_figure,
-    not_positive,
     paint_map,
     paint_surface,
     panels,
@@ -188,7 +188,7 @@ def _draw_map(
     ax: Axes, seen: View, F: IntArray, uv: FloatArray, inverted: ArrayLike | None, fixed: ArrayLike | None
 ) -> int:
     """Draw a map into axes and return the number of its inverted triangles."""
-    marked = _check_inverted(inverted, len(F)) if inverted is not None else not_positive(F, uv)
+    marked = _check_inverted(inverted, len(F)) if inverted is not None else find_not_positive(F, uv)
     paint_map(ax, F, uv, seen.color, marked, fixed)
     return int(marked.size)
 

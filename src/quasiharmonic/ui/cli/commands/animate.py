@@ -108,7 +108,7 @@ def run(options: argparse.Namespace) -> int:
     with report.name_source(options.input):
         problem = Problem(mesh.V, mesh.F, fixed, positions[0])
     given = pick(options, "polish", "max_motion_ratio", "fill_gaps", "max_iterations", "linear_solver")
-    with pipeline.working(options.input, _words) as show:
+    with pipeline.show_work(options.input, _words) as show:
         animation = animate(problem, positions, callback=show, **given)
     if not animation.frames:
         raise KeyboardInterrupt

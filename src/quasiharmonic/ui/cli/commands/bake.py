@@ -22,7 +22,7 @@ from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
     add_options,
-    declared,
+    declare_options,
     number,
     pick,
     texture_size,
@@ -48,7 +48,7 @@ def add_parser(commands: Commands) -> None:
     sides = number(
         texture_size, "side of the textures in texels, or WIDTHxHEIGHT (default: 2048)", default=(2048, 2048)
     )
-    add_options(parser, size=sides, **declared(BakeOptions))
+    add_options(parser, size=sides, **declare_options(BakeOptions))
     add_options(parser, "json")
 
 
@@ -71,8 +71,8 @@ def _bake(options: argparse.Namespace, new: MeshData) -> pipeline.Changed:
     from quasiharmonic.apps.baking.bake import bake
 
     old = _read(options, options.input)
-    with pipeline.working(options.new):
-        result = bake(old, new, **pick(options, "size", *declared(BakeOptions)))
+    with pipeline.show_work(options.new):
+        result = bake(old, new, **pick(options, "size", *declare_options(BakeOptions)))
 
     def describe(_: MeshData) -> pipeline.Account:
         facts = {**result.to_dict(), "new": str(options.new)}

@@ -33,7 +33,7 @@ from quasiharmonic.ui.cli.arguments import (
     choice,
     convert,
     count,
-    declared,
+    declare_options,
     file,
     flag,
     number,
@@ -47,8 +47,8 @@ from quasiharmonic.util.options import ENERGIES, FLATTENED, DescentOptions, Unwr
 if TYPE_CHECKING:
     from quasiharmonic.ui.batch import Progress
 
-# Options of `unwrap` that are options of a run.
-_OF_RUNS = "jobs", "time_limit"
+# The options of `unwrap` that are not options of a run.
+_UNWRAP = {name: one for name, one in declare_options(UnwrapOptions).items() if name not in ("jobs", "time_limit")}
 #: Seconds between two updates of the line on a terminal.
 LIVE = 0.1
 
@@ -131,7 +131,7 @@ def add_parser(commands: Commands) -> None:
     }
     add_options(solver, "font", **of_outlines)
     add_options(solver, "pieces", "refine", strategy=SHARED["strategy"] | {"default": None})
-    add_options(solver, **declared(DescentOptions))
+    add_options(solver, **declare_options(DescentOptions))
     add_options(solver, "reference", "max_iterations", "linear_solver")
     models = parser.add_argument_group("texture coordinates of each model, as for qhm unwrap")
     add_options(
@@ -139,7 +139,7 @@ def add_parser(commands: Commands) -> None:
         unwrap=flag("unwrap every mesh file: charts with little stretch, packed into a texture"),
         resolution=number(texture_size, "side of the texture in texels, or WIDTHxHEIGHT (default: 2048)"),
         # The defaults are those of `unwrap`; the limits of a run are options of their own.
-        **{name: one | {"default": None} for name, one in declared(UnwrapOptions).items() if name not in _OF_RUNS},
+        **{name: one | {"default": None} for name, one in _UNWRAP.items()},
     )
 
 
@@ -190,8 +190,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _unwrap_options(options: argparse.Namespace) -> dict[str, Any] | None:
     """Return the given options of `unwrap`, or None without --unwrap."""
-    names = ["resolution", *(name for name in declared(UnwrapOptions) if name not in _OF_RUNS)]
-    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    given = {name: value for name, value in pick(options, "resolution", *_UNWRAP).items() if value is not None}
     if options.unwrap:
         return given | ({"symmetry": None} if given.get("symmetry") == "none" else {})
     for name in given:

@@ -27,7 +27,7 @@ from quasiharmonic.ui.cli.arguments import (
     add_files,
     add_options,
     choice,
-    declared,
+    declare_options,
     file,
     flag,
     number,
@@ -42,10 +42,6 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
 
 
-# Distance between pieces, in allowances; with 2 or less the allowances would touch.
-_PIECE_GAP = 2.1
-
-
 def add_parser(commands: Commands) -> None:
     """Declare the command."""
     from quasiharmonic.io.registry import format_names
@@ -54,7 +50,7 @@ def add_parser(commands: Commands) -> None:
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map')} file to write")
     add_options(
         parser,
-        **declared(FlattenOptions),
+        **declare_options(FlattenOptions),
         weights=file("file of triangle weights, one positive number per line"),
         start=flag("start from the map in the input's texture coordinates (vt)"),
         fixed=file("file of vertices, 0-based, one per line, to fix at the input's vt"),
@@ -115,9 +111,10 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
     kept = np.flatnonzero(joint == np.arange(len(mesh.V)))
     if (close := kept[find_close_vertices(mesh.V[kept], triangles)]).size:
         process.tell(describe_soup(close))
-    given |= pick(options, "start", "rings", "islands", "linear_solver", *declared(FlattenOptions))
-    with pipeline.working(options.input) as show:
-        mapped = atlas.flatten(found.mesh, gap=_PIECE_GAP * options.allowance, callback=show, **given)
+    given |= pick(options, "start", "rings", "islands", "linear_solver", *declare_options(FlattenOptions))
+    with pipeline.show_work(options.input) as show:
+        # With a gap of at most two allowances, those of two pieces would touch.
+        mapped = atlas.flatten(found.mesh, gap=2.1 * options.allowance, callback=show, **given)
 
     def describe(written: MeshData) -> pipeline.Account:
         certified = pipeline.certify_map(written, weld=options.weld)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli.arguments import Commands, add_command, add_files, add_options, declared, flag, number
+from quasiharmonic.ui.cli.arguments import Commands, add_command, add_files, add_options, declare_options, flag, number
 from quasiharmonic.ui.cli.commands import polish
 from quasiharmonic.util.options import HarmoniseOptions
 
@@ -34,7 +34,7 @@ def add_parser(commands: Commands) -> None:
     add_options(
         parser,
         "fixed",
-        **declared(HarmoniseOptions),
+        **declare_options(HarmoniseOptions),
         eta=number(
             float,
             "weight of the energy against injectivity, one for each round (default: four rounds, "

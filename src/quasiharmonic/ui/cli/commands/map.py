@@ -25,7 +25,7 @@ from quasiharmonic.ui.cli.arguments import (
     add_files,
     add_options,
     choice,
-    declared,
+    declare_options,
     file,
     flag,
     pick,
@@ -76,7 +76,7 @@ def add_parser(commands: Commands) -> None:
     )
     add_options(parser, "slide", "pieces")
     solver = parser.add_argument_group("solution")
-    add_options(solver, *declared(MapOptions), **declared(DescentOptions))
+    add_options(solver, *declare_options(MapOptions), **declare_options(DescentOptions))
     add_options(solver, "reference", "linear_solver")
 
 
@@ -114,7 +114,7 @@ def _map(
     from quasiharmonic.solver.refine.attempts import on_refinement
     from quasiharmonic.solver.search.stages import select_strategy
 
-    strategy = select_strategy(options.strategy, **pick(options, *declared(DescentOptions)))
+    strategy = select_strategy(options.strategy, **pick(options, *declare_options(DescentOptions)))
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
     map_options.check_options(options, mesh, fixed)
     found = map_options.surface(options, mesh, disks_too=False)
@@ -127,7 +127,7 @@ def _map(
         one = map_options.make_problem(options, island, fixed, len(posed))
         posed.append(one)
         problem = one.fitted.problem
-        given = pick(options, "polish", "linear_solver", *declared(MapOptions))
+        given = pick(options, "polish", "linear_solver", *declare_options(MapOptions))
         given["strategy"] = strategy
         slide = one.slide if options.polish else False
         with process.progress_line() as show:

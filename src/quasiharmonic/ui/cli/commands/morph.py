@@ -263,7 +263,7 @@ def _morph(
     if steps > 1 and given["rest"] is None:
         given = given | {"rest": mesh.points}
     results: list[MorphResult | TetrahedraResult] = []
-    with pipeline.working(options.input) as show:
+    with pipeline.show_work(options.input) as show:
         for k in range(1, steps + 1):
             before = results[-1].points if results else mesh.points
             one = morph(

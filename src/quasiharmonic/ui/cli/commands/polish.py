@@ -20,7 +20,7 @@ from quasiharmonic.ui.cli.arguments import (
     add_command,
     add_files,
     add_options,
-    declared,
+    declare_options,
     file,
     flag,
     pick,
@@ -62,7 +62,7 @@ def add_parser(commands: Commands) -> None:
         fixed=file(
             "file of fixed vertices, 0-based, one per line (default: the boundary; with --slide none but the corners)"
         ),
-        **declared(PolishOptions),
+        **declare_options(PolishOptions),
         free=flag("free the boundary; each island stays near its position"),
     )
     add_options(
@@ -119,7 +119,7 @@ def lower_distortion(
         before = io.mapped(mesh)
         given = pick(options, "energy", "max_iterations", "linear_solver")
         given["fixed"] = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
-        with pipeline.working(options.input) as show:
+        with pipeline.show_work(options.input) as show:
             after = lower(before, {**given, "callback": show})
 
         def describe(file: MeshData) -> pipeline.Account:

@@ -62,7 +62,7 @@ def _repair(options: argparse.Namespace, mesh: MeshData) -> pipeline.Changed:
             f"{options.input}: there is no map to repair: no face has texture coordinates (vt) at all three corners"
         )
     given = pick(options, "whole", "unmirror", "max_iterations", "linear_solver")
-    with pipeline.working(options.input) as show:
+    with pipeline.show_work(options.input) as show:
         result = repair(mesh.V, mesh.F, mesh.vt, FT=mesh.FT, callback=show, **given)
     repaired = replace(mesh, vt=result.uv, FT=result.FT)
 

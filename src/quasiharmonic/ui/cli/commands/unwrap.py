@@ -31,7 +31,7 @@ from quasiharmonic.ui.cli.arguments import (
     add_options,
     byte_count,
     choice,
-    declared,
+    declare_options,
     degrees,
     file,
     flag,
@@ -56,7 +56,7 @@ def add_parser(commands: Commands) -> None:
 
     parser = add_command(commands, "unwrap", __doc__, run)
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map', 'seams')} file to write")
-    own = declared(UnwrapOptions)
+    own = declare_options(UnwrapOptions)
     add_options(
         parser,
         **own,
@@ -170,10 +170,10 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
 
     for k in range(options.channel):
         io.select_channel(mesh, k)  # raises an error before the work if the file does not have this one
-    given = pick(options, "resolution", "stack", "weld", *declared(UnwrapOptions))
+    given = pick(options, "resolution", "stack", "weld", *declare_options(UnwrapOptions))
     if options.symmetry == "none":
         given["symmetry"] = None
-    with pipeline.working(options.input, _words) as show:
+    with pipeline.show_work(options.input, _words) as show:
         result = unwrap(
             mesh.V,
             mesh.F,
