@@ -81,11 +81,6 @@ def least_coefficients(grid: VoxelGrid, field: FloatArray) -> FloatArray:
     return least
 
 
-def trilinear_fold_free(grid: VoxelGrid, field: FloatArray) -> BoolArray:
-    """Return the cells (d − 1, h − 1, w − 1) whose determinant is certainly positive everywhere."""
-    return np.asarray(least_coefficients(grid, field) > 0)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class InvertibleField(NearestField):
     """A displacement field without folds, and its distance from the given one.
@@ -225,7 +220,7 @@ def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0, interpolation: str 
     if np.ndim(field) == 4:
         volume, scaled, _ = in_units(check_field(field), spacing)
         if interpolation == "trilinear":
-            return trilinear_fold_free(volume, scaled)
+            return np.asarray(least_coefficients(volume, scaled) > 0)
         return ~find_folded_cells(volume, scaled, None)
     if interpolation != "linear":
         raise ValueError("trilinear interpolation is that of volumes: omit interpolation")

@@ -88,22 +88,20 @@ class Minimum:
     def _converge(self, steps: int) -> float:
         """Take steps until converged, leave the system factored, and return the strain of the step not taken."""
         last = np.inf
-        for left in range(steps, -1, -1):
+        while True:
             heartbeat()
-            gradient = self._evaluate()
-            step, self._exact = self._direction(gradient)
+            step, self._exact = self._direction(self._evaluate())
             size = self._strain(step)
             if size <= _ZERO_STRAIN or (self._exact and size <= _ROUNDING_STRAIN and size > 0.5 * last):
                 return size
-            if not left or not self._take_step(step):
+            if not steps or not self._take_step(step):
                 return size
             if self._exact and size <= _REUSE_STRAIN:
                 # Convergence is quadratic, so this was the last step, and the factor is accurate to the same number of
                 # digits.
                 self._evaluate()
                 return size
-            last = size
-        raise AssertionError("the last step has already returned")
+            last, steps = size, steps - 1
 
     def _evaluate(self) -> ComplexArray:
         """Evaluate the energy at the current map; return its gradient with respect to the unknowns."""

@@ -252,16 +252,12 @@ class MovingMesh:
     @property
     def points(self) -> FloatArray:
         """A copy of the current mesh; every triangle or tetrahedron is strictly positive, verified exactly."""
-        if self._volume is not None:
-            return self._volume.points.copy()
-        return self._points.copy()
+        return (self._points if self._volume is None else self._volume.points).copy()
 
     @property
     def F(self) -> IntArray:
         """The triangles (f, 3), counterclockwise, or tetrahedra (f, 4), positive."""
-        if self._volume is not None:
-            return self._volume.T
-        return self._domain.F
+        return self._domain.F if self._volume is None else self._volume.T
 
     def advance(self, target: ArrayLike) -> FloatArray:
         """Move the boundary, and the mesh with it.

@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.tetrahedra.sliding import project
 from quasiharmonic.energies.newton.line_search import backtrack
 from quasiharmonic.util.arrays import FloatArray, IntArray, invert_indices
 from quasiharmonic.util.progress import heartbeat
@@ -237,6 +236,11 @@ _MAX_CONJUGATE_STEPS = 250
 _QUICK_DECREASE = 0.1
 _MAX_REPEATED = 10
 _MIN_EPSILON = 1e-14
+
+
+def project(projections: FloatArray | None, x: FloatArray) -> FloatArray:
+    """Project directions (k, 3) to those in which the vertices move; None restricts nothing."""
+    return x if projections is None else np.asarray(np.einsum("iab,ib->ia", projections, x))
 
 
 class TetrahedraDescent:

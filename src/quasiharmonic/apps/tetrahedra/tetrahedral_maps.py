@@ -13,13 +13,14 @@ from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
 from quasiharmonic.apps.tetrahedra.elements import tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.placement import (
     RestMesh,
+    Sliding,
     check_rest,
     extend_harmonically,
+    find_sliding,
     make_energy,
     place_vertices,
 )
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
-from quasiharmonic.apps.tetrahedra.sliding import Sliding, find_sliding
 from quasiharmonic.problem.result import Step
 from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, names_of, vertex_indices
 from quasiharmonic.util.options import MorphOptions, TetrahedraOptions, takes

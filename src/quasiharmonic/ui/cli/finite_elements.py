@@ -33,25 +33,20 @@ def has_elements(path: Path) -> bool:
 
 def check(options: argparse.Namespace) -> int:
     """Report what the mesh is and which elements are inverted; return the exit status of ``qhm check``."""
-    from quasiharmonic.geometry.mesh.elements import name_elements
+    from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
+    from quasiharmonic.geometry.mesh.elements import covering_triangles, name_elements
     from quasiharmonic.io.fem.files import read_fem, read_volume
     from quasiharmonic.problem.inspection import inspect_mesh
     from quasiharmonic.util.arrays import count_of
 
-    names = (
-        ("precision", "--as"),
-        ("any_triangulation", "--any-triangulation"),
-        ("fixed", "--fixed"),
-        ("weld", "--weld"),
-    )
-    _reject(options, *names)
+    _reject(options, "any_triangulation", "fixed", "weld", precision="--as")
     volume = read_volume(options.input)
     if len(volume.F):
         return _check_volume(options, volume)
     mesh = read_fem(options.input)
-    triangles, _, inverted = _split(mesh)
+    inverted = inverted_elements(mesh.F, mesh.points)
     with report.name_source(options.input):
-        found = inspect_mesh(mesh.points, triangles)
+        found = inspect_mesh(mesh.points, covering_triangles(mesh.F)[0])
     elements = count_of("element", "elements", len(mesh.F))
     verdict = f"inverted: {name_elements(mesh.F, inverted)}" if inverted.size else f"None of {elements} is inverted."
     facts = {
@@ -97,7 +92,7 @@ def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
 
 def measure(options: argparse.Namespace) -> int:
     """Report the quality of the elements; return the exit status of ``qhm measure``."""
-    _reject(options, ("export", "--export"), ("distances", "--distances"))
+    _reject(options, "export", "distances")
     mesh, quality = _read_quality(options.input)
     facts: dict[str, Any] = {
         "input": str(options.input),
@@ -115,18 +110,19 @@ def plot(options: argparse.Namespace) -> int:
     """Draw the elements, or a cut through tetrahedra, coloured by quality; return the exit status of ``qhm plot``."""
     import numpy as np
 
+    from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
     from quasiharmonic.ui.plot.canvas import save_picture
     from quasiharmonic.ui.plot.elements import cut_tetrahedra, elements_figure, outline_elements
 
     if options.kind not in (None, "map"):
         raise ValueError(f"--kind {options.kind} needs a surface with a map: omit it for {options.input.suffix} files")
-    _reject(options, ("texture", "--texture"), ("measure", "--measure"))
+    _reject(options, "texture", "measure")
     mesh, quality = _read_quality(options.input)
     if mesh.points.shape[1] == 3:
         drawn = cut_tetrahedra(mesh.F, mesh.points, int(quality.argmin()))
         inverted = np.flatnonzero(quality <= 0)
     else:
-        drawn, inverted = outline_elements(mesh.F, mesh.points), _split(mesh)[2]
+        drawn, inverted = outline_elements(mesh.F, mesh.points), inverted_elements(mesh.F, mesh.points)
     save_picture(options.output, elements_figure([drawn], [quality], inverted))
     return report.tell_written(options.output)
 
@@ -156,18 +152,9 @@ def _read_quality(path: Path) -> tuple[FemMesh, NDArray[np.float64]]:
     return mesh, element_quality(mesh.F, mesh.points)
 
 
-def _split(mesh: FemMesh) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return triangles that cover the elements, the element of each, and the inverted elements."""
-    from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
-    from quasiharmonic.geometry.mesh.elements import covering_triangles
-
-    triangles, of = covering_triangles(mesh.F)
-    return triangles, of, inverted_elements(mesh.F, mesh.points)
-
-
-def _reject(options: argparse.Namespace, *names: tuple[str, str]) -> None:
-    """Raise ValueError for options that have no meaning for finite-element meshes."""
-    for name, option in names:
+def _reject(options: argparse.Namespace, *names: str, **written: str) -> None:
+    """Raise ValueError for options that have no meaning for finite-element meshes; some are ``written`` differently."""
+    for name, option in {**{name: "--" + name.replace("_", "-") for name in names}, **written}.items():
         if getattr(options, name) not in (None, False):
             raise ValueError(f"{option} needs a surface with a map: omit it for {options.input.suffix} files")
 

@@ -113,6 +113,7 @@ def _map(
     from quasiharmonic.solver.mapping import solve
     from quasiharmonic.solver.refine.attempts import on_refinement
     from quasiharmonic.solver.search.stages import select_strategy
+    from quasiharmonic.util.arrays import names_of
 
     strategy = select_strategy(options.strategy, **pick(options, *declare_options(DescentOptions)))
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
@@ -175,7 +176,8 @@ def _map(
         if added:
             notes.append(f"split {added} {'edge' if added == 1 else 'edges'}: new vertices are at the end of the list")
         notes += [
-            describe_crowded(island.vertices[one.result.crowded])
+            "double precision is insufficient next to the fixed "
+            + names_of("vertex", "vertices", island.vertices[one.result.crowded])
             for island, one in zip(islands, mapped.islands, strict=False)
             if one.result.crowded.size
         ]
@@ -183,13 +185,6 @@ def _map(
         return pipeline.Account(facts, lines, certified.injective)
 
     return pipeline.Changed(new, describe)
-
-
-def describe_crowded(vertices: NDArray[np.int64]) -> str:
-    """Return a sentence about vertices where double precision is too coarse for a map."""
-    from quasiharmonic.util.arrays import names_of
-
-    return f"double precision is insufficient next to the fixed {names_of('vertex', 'vertices', vertices)}"
 
 
 def draw(path: Path, certified: WrittenMap, problems: list[Problem], mapped: MappedAtlas, kind: str = "map") -> None:
