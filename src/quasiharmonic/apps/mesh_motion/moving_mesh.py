@@ -46,7 +46,7 @@ from quasiharmonic.util.arrays import (
     check_finite,
     check_integer,
     map_array,
-    names_of,
+    reject,
     sum_at,
     triangle_array,
     vertex_indices,
@@ -224,9 +224,7 @@ class MovingMesh:
         self._points = map_array("points", points)
         F = triangle_array(F, len(self._points))
         ratio = mean_ratio(self._points, F)
-        flat = np.flatnonzero(ratio == 0)
-        if flat.size:
-            raise ValueError(f"{names_of('triangle', 'triangles', flat)} degenerate: repair the mesh first")
+        reject(ratio == 0, "triangle", "triangles", "{} degenerate: repair the mesh first")
         F[ratio < 0] = F[ratio < 0][:, [0, 2, 1]]
         check_spread(F, len(self._points))
         self._moved = vertex_indices("moved_vertices", moved_vertices, len(self._points))

@@ -34,6 +34,7 @@ from quasiharmonic.util.arrays import (
     mark,
     names_of,
     real_array,
+    reject,
 )
 from quasiharmonic.util.options import TetrahedraOptions
 
@@ -175,11 +176,8 @@ def check_rest(T: ArrayLike, X: FloatArray) -> RestMesh:
     if not len(T):
         raise ValueError("the mesh has no tetrahedra")
     sign, nonfinite = tetrahedron_signs(T, X)
-    if nonfinite.size:
-        raise ValueError(f"points are not finite at {names_of('tetrahedron', 'tetrahedra', nonfinite)}")
-    flat = np.flatnonzero(sign == 0)
-    if flat.size:
-        raise ValueError(f"{names_of('tetrahedron', 'tetrahedra', flat)} degenerate at rest: repair the mesh first")
+    reject(nonfinite, "tetrahedron", "tetrahedra", "points are not finite at {}")
+    reject(sign == 0, "tetrahedron", "tetrahedra", "{} degenerate at rest: repair the mesh first")
     T = np.where((sign < 0)[:, None], T[:, [1, 0, 2, 3]], T)
     faces = inspect_faces(T, len(X))
     for found, what in (
@@ -295,11 +293,8 @@ def make_energy(mesh: RestMesh, begin: FloatArray, whole: bool) -> tuple[ShapeEn
             ratio = new / old if old > 0 else 0.0
         scale = float(np.cbrt(ratio)) if 0 < ratio < np.inf else 2.0 ** (exponents[0] - exponents[1])
         energy = ShapeEnergy(mesh.T, rest * scale)
-    bad = np.flatnonzero(~np.isfinite(energy.gradients).all(axis=(0, 1)))
-    if bad.size:
-        raise ValueError(
-            f"{names_of('tetrahedron', 'tetrahedra', bad)} too thin or too small at rest for double precision"
-        )
+    bad = np.asarray(~np.isfinite(energy.gradients).all(axis=(0, 1)))
+    reject(bad, "tetrahedron", "tetrahedra", "{} too thin or too small at rest for double precision")
     return energy, X, exponents[1]
 
 

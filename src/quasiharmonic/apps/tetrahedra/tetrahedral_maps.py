@@ -22,7 +22,7 @@ from quasiharmonic.apps.tetrahedra.placement import (
 )
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
 from quasiharmonic.problem.result import Step
-from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, names_of, vertex_indices
+from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, reject, vertex_indices
 from quasiharmonic.util.options import MorphOptions, TetrahedraOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
@@ -131,12 +131,9 @@ def find_fixed(
 ) -> tuple[IntArray, IntArray, Sliding]:
     """Return the moved vertices, checked, the boundary vertices that neither move nor slide, and those that slide."""
     moved = vertex_indices("moved_vertices", moved_vertices, len(points))
-    times = np.bincount(moved, minlength=1)
-    if times.max() > 1:
-        raise ValueError(f"{names_of('vertex', 'vertices', np.flatnonzero(times > 1))} moved more than once")
+    reject(np.bincount(moved) > 1, "vertex", "vertices", "{} moved more than once")
     idle = moved[~np.isin(moved, mesh.T)]
-    if idle.size:
-        raise ValueError(f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, in no tetrahedron")
+    reject(idle, "vertex", "vertices", "moved_vertices refers to {}, in no tetrahedron")
     sliding = find_sliding(mesh.faces.boundary, points, moved, slide)
     return moved, np.setdiff1d(mesh.boundary_vertices, np.concatenate([moved, sliding.vertices])), sliding
 
