@@ -207,7 +207,7 @@ class _Baker:
     """The work of one call: the rows of the new texture, block by block."""
 
     def __init__(self, old: MeshData, new: MeshData, size: tuple[int, int], wanted: BakeOptions) -> None:
-        self._old, self._new, self._wanted = old, new, wanted
+        self._new, self._wanted = new, wanted
         self._width, self._height = size
         self._look = SurfaceLook(read_appearance(old))
         self.problems = self._look.problems
@@ -220,7 +220,8 @@ class _Baker:
         self._raster = self._make_raster(uv)
         self._frames: tuple[TangentFrames, TangentFrames] | None = None
         if self._look.has("normal"):
-            self._frames = self._old_frames(), tangent_frames(new, uv)
+            coordinates = self._look.normal_coordinates() * [1, -1] + [0, 1]
+            self._frames = tangent_frames(old, coordinates), tangent_frames(new, uv)
         materials = self._look.materials
         self._strength = max([1.0, *(value for material in materials for value in material.emission)])
 
@@ -244,11 +245,6 @@ class _Baker:
         scale = np.array([self._width, -self._height]) * samples
         placed = np.nan_to_num(uv * scale + [0, self._height * samples])
         return Raster(placed, self._width * samples, self._height * samples, degenerate | bare)
-
-    def _old_frames(self) -> TangentFrames:
-        """Return the frames of the normal maps of the old model."""
-        coordinates = self._look.normal_coordinates()
-        return tangent_frames(self._old, coordinates * [1, -1] + [0, 1])
 
     def bake(self) -> dict[str, Bytes]:
         """Return the images by name, and what is covered, as ``covered``."""

@@ -123,12 +123,17 @@ def quasi_harmonic_derivative(
 _NOT_FOUND = "no map was found, so there is no derivative"
 
 
-class PolishDerivativeKeywords(TypedDict, total=False):
-    """Types of the options of `polish_derivative`."""
+class DerivativeKeywords(TypedDict, total=False):
+    """Types of the options that the derivatives of polished and flattened maps share."""
 
     energy: str | Energy
     weights: ArrayLike | None
     linear_solver: str
+
+
+class PolishDerivativeKeywords(DerivativeKeywords, total=False):
+    """Types of the options of `polish_derivative`."""
+
     slide: bool | BoundaryCurves
 
 
@@ -250,13 +255,10 @@ def _place_map(w: ComplexArray, exponent: int, fixed: IntArray, given: FloatArra
     return uv
 
 
-class FlattenDerivativeKeywords(TypedDict, total=False):
+class FlattenDerivativeKeywords(DerivativeKeywords, total=False):
     """Types of the options of `flatten_derivative`."""
 
     fixed: ArrayLike | None
-    energy: str | Energy
-    weights: ArrayLike | None
-    linear_solver: str
 
 
 @accepts_mesh

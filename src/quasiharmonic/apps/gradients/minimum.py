@@ -67,7 +67,10 @@ class Minimum:
         self.doubts: list[Doubt] = []
         with np.errstate(all="ignore"):
             left = self._converge(_MAX_STEPS if converge else 0)
-            self.forces = self._forces(self._deformation)
+            d, density = self._deformation, energy.energy
+            curvature = density.curvature(d, negative=1.0)
+            corners = np.ascontiguousarray(energy.F.T)
+            self.forces = Forces(corners, w.size, energy.g, energy.share, d.p, d.q, *density.gradient(d), curvature)
             self._check_numbers()
             if not self._exact:
                 self._factor_by_lu()
@@ -150,13 +153,6 @@ class Minimum:
         self.w = taken.state
         self._freedom.keep()
         return True
-
-    def _forces(self, d: Deformation) -> Forces:
-        energy = self._energy
-        by_p, by_q = energy.energy.gradient(d)
-        form = energy.energy.curvature(d, negative=1.0)
-        corners = np.ascontiguousarray(energy.F.T)
-        return Forces(corners, self.w.size, energy.g, energy.share, d.p, d.q, by_p, by_q, form)
 
     def _check_numbers(self) -> None:
         """Raise a ValueError where the energy or a derivative of it is NaN or infinite."""

@@ -20,6 +20,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from inspect import cleandoc
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn
@@ -225,5 +226,11 @@ def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
         dest="command", metavar="COMMAND", required=True, help=argparse.SUPPRESS, prog="qhm"
     )
     for name in names:
-        import_module(f"{__name__}.commands.{name}").add_parser(commands)
+        module = import_module(f"{__name__}.commands.{name}")
+        # A title, which the help leaves out, what the command does, the exit status, and examples.
+        _, description, epilog, examples = [*cleandoc(module.__doc__ or "").split("\n\n"), *[""] * 4][:4]
+        lines = [line.strip() for line in examples.splitlines()]
+        command = commands.add_parser(name, description=description, epilog=epilog, examples=lines)
+        command.set_defaults(run=module.run)
+        module.declare_arguments(command)
     return parser

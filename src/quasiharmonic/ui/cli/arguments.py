@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import Field, fields
-from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -15,28 +14,12 @@ from quasiharmonic.util import options
 from quasiharmonic.util.options import Options
 
 T = TypeVar("T")
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Option: TypeAlias = dict[str, Any]  # Keywords of `add_argument`
 
 # Copies of names in energies.measures, so that the parser does not import this module.
 MEASURES = ("sigma1", "sigma2", "mips", "conformal", "isometric", "symmetric_dirichlet", "arap", "area_ratio", "shear")
 # Defaults for packing, in texels.
 RESOLUTION, PADDING = 1024, 4
-
-
-def add_command(
-    commands: Commands, name: str, text: str | None, run: Callable[[argparse.Namespace], int]
-) -> argparse.ArgumentParser:
-    """Declare a command, and return its parser.
-
-    ``text`` is the docstring of the command's module. It has four paragraphs: a title, which the help leaves out, what
-    the command does, the exit status, and examples.
-    """
-    _, description, epilog, examples = [*cleandoc(text or "").split("\n\n"), *[""] * 4][:4]
-    lines = tuple(line.strip() for line in examples.splitlines())
-    parser = commands.add_parser(name, description=description, epilog=epilog, examples=lines)
-    parser.set_defaults(run=run)
-    return parser
 
 
 def flag(words: str) -> Option:

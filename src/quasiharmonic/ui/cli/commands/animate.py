@@ -19,8 +19,6 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, report
 from quasiharmonic.ui.cli.arguments import (
-    Commands,
-    add_command,
     add_options,
     choice,
     count,
@@ -41,11 +39,10 @@ if TYPE_CHECKING:
 PICTURES = ".gif", ".mp4"
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "animate", __doc__, run)
     parser.add_argument("input", type=Path, metavar="INPUT", help=f"{format_names('read')} file: the surface")
     parser.add_argument(
         "targets",

@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline
 from quasiharmonic.ui.cli.arguments import (
-    Commands,
-    add_command,
     add_files,
     add_options,
     declare_options,
@@ -33,11 +31,10 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "bake", __doc__, run)
     add_files(
         parser,
         f"{format_names('read')} file with the look",

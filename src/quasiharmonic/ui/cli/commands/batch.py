@@ -26,8 +26,6 @@ from typing import TYPE_CHECKING, Any
 from quasiharmonic.ui.cli import map_options, process, report
 from quasiharmonic.ui.cli.arguments import (
     SHARED,
-    Commands,
-    add_command,
     add_options,
     byte_count,
     choice,
@@ -53,9 +51,8 @@ _UNWRAP = {name: one for name, one in declare_options(UnwrapOptions).items() if 
 LIVE = 0.1
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
-    parser = add_command(commands, "batch", __doc__, run)
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     parser.add_argument(
         "source",
         metavar="DIR_OR_LIST",

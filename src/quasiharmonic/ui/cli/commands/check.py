@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report
-from quasiharmonic.ui.cli.arguments import Commands, add_command, add_options, choice, file, flag, weld
+from quasiharmonic.ui.cli.arguments import add_options, choice, file, flag, weld
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,11 +40,10 @@ _MIN_TURN = 20.0
 _LISTED = 100
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "check", __doc__, run)
     parser.add_argument(
         "input",
         type=Path,

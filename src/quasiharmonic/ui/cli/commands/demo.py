@@ -14,14 +14,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from quasiharmonic.ui.cli.arguments import Commands, add_command
-
 LETTER = "R"
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
-    parser = add_command(commands, "demo", __doc__, run)
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("qhm-demo"), metavar="DIR", help="folder to write to (qhm-demo)"
     )

@@ -22,8 +22,6 @@ from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import map_options, pipeline, process, report
 from quasiharmonic.ui.cli.arguments import (
-    Commands,
-    add_command,
     add_files,
     add_options,
     choice,
@@ -42,11 +40,10 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "flatten", __doc__, run)
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map')} file to write")
     add_options(
         parser,

@@ -20,8 +20,6 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import map_options, pipeline, process, report
 from quasiharmonic.ui.cli.arguments import (
-    Commands,
-    add_command,
     add_files,
     add_options,
     choice,
@@ -46,11 +44,10 @@ if TYPE_CHECKING:
     from quasiharmonic.ui.cli.pipeline import WrittenMap
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "map", __doc__, run)
     add_files(
         parser,
         f"{format_names('read')} file, or a folder with input.obj and handles.txt",

@@ -17,17 +17,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report
-from quasiharmonic.ui.cli.arguments import Commands, add_command, add_options, file, flag, set_default
+from quasiharmonic.ui.cli.arguments import add_options, file, flag, set_default
 
 if TYPE_CHECKING:
     from quasiharmonic.energies.measures import Distortion
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "measure", __doc__, run)
     parser.add_argument(
         "input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map, injective or not"
     )

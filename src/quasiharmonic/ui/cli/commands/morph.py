@@ -23,8 +23,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from quasiharmonic.ui.cli import pipeline, report
 from quasiharmonic.ui.cli.arguments import (
-    Commands,
-    add_command,
     add_files,
     add_options,
     choice,
@@ -47,11 +45,10 @@ if TYPE_CHECKING:
     Moved: TypeAlias = tuple[IntArray, Callable[[float], FloatArray]]
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "morph", __doc__, run)
     add_files(
         parser,
         f"{format_names('read_elements')} file, text or binary",

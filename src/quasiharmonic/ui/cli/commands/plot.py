@@ -15,15 +15,14 @@ import argparse
 from pathlib import Path
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report
-from quasiharmonic.ui.cli.arguments import MEASURES, Commands, add_command, add_options, choice, set_default, text
+from quasiharmonic.ui.cli.arguments import MEASURES, add_options, choice, set_default, text
 from quasiharmonic.ui.cli.pipeline import CHECKERBOARD
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "plot", __doc__, run)
     parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="IMAGE", help="image to write: .png, .svg or .pdf"

@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import map_options, pipeline
 from quasiharmonic.ui.cli.arguments import (
-    Commands,
-    add_command,
     add_files,
     add_options,
     declare_options,
@@ -50,11 +48,10 @@ _MEASURED = {
 }
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "polish", __doc__, run)
     form = format_names("write_map")
     add_files(parser, f"{form} file with an injective map", f"{form} file to write")
     add_options(

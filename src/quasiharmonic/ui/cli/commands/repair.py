@@ -16,17 +16,16 @@ import argparse
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline
-from quasiharmonic.ui.cli.arguments import Commands, add_command, add_files, add_options, count, flag, number, pick
+from quasiharmonic.ui.cli.arguments import add_files, add_options, count, flag, number, pick
 
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "repair", __doc__, run)
     add_files(
         parser,
         f"{format_names('read', 'seams')} file with texture coordinates",

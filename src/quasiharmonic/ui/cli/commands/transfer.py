@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import Commands, add_command, add_options, choice, file, set_default
+from quasiharmonic.ui.cli.arguments import add_options, choice, file, set_default
 
 if TYPE_CHECKING:
     import numpy as np
@@ -41,11 +41,10 @@ class _MappedFile:
     origin: NDArray[np.int64]  # For each vertex of the cut surface, the vertex of the file; -1 without triangles
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "transfer", __doc__, run)
     for name, text in (("source", "surface that the data belong to"), ("target", "surface that receives them")):
         parser.add_argument(
             name, type=Path, metavar=name.upper(), help=f"{text}: {format_names('write_map')} file with a map"

@@ -25,8 +25,6 @@ from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline
 from quasiharmonic.ui.cli.arguments import (
-    Commands,
-    add_command,
     add_files,
     add_options,
     byte_count,
@@ -45,16 +43,14 @@ from quasiharmonic.ui.cli.arguments import (
 from quasiharmonic.util.options import INSTANCES, BakeOptions, UnwrapOptions
 
 if TYPE_CHECKING:
-    from quasiharmonic.apps.baking.bake import BakeResult
     from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStep
     from quasiharmonic.io import MeshData
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "unwrap", __doc__, run)
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map', 'seams')} file to write")
     own = declare_options(UnwrapOptions)
     add_options(
@@ -196,8 +192,12 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         )
     unwrapped, divided = add_map(mesh, result)
     unwrapped = io.place_map(unwrapped, mesh, options.channel)
-    baked = _bake(options, mesh, unwrapped)
-    unwrapped = unwrapped if baked is None else baked.mesh
+    baked = None
+    if options.bake:
+        from quasiharmonic.apps.baking.bake import bake
+
+        baked = bake(mesh, unwrapped, size=options.resolution)
+        unwrapped = baked.mesh
 
     def describe(written: MeshData) -> pipeline.Account:
         same = is_written(written, result)
@@ -242,15 +242,6 @@ def _check_bake(options: argparse.Namespace) -> None:
         raise ValueError("--bake makes one texture: omit --tiles and --tile-by")
     BakeOptions(size=options.resolution)
     pipeline.check_image_output(options)
-
-
-def _bake(options: argparse.Namespace, mesh: MeshData, unwrapped: MeshData) -> BakeResult | None:
-    """Bake the look of the mesh for its new texture coordinates, if ``--bake`` is given."""
-    if not options.bake:
-        return None
-    from quasiharmonic.apps.baking.bake import bake
-
-    return bake(mesh, unwrapped, size=options.resolution)
 
 
 def _words(step: UnwrapStep) -> str:

@@ -15,14 +15,13 @@ import argparse
 from pathlib import Path
 
 from quasiharmonic.ui.cli import report
-from quasiharmonic.ui.cli.arguments import Commands, add_command, add_options, file
+from quasiharmonic.ui.cli.arguments import add_options, file
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "view", __doc__, run)
     parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
     shot = file("write the view to this file instead of opening a window; needs no display", metavar="PNG")
     add_options(parser, "surface", screenshot=shot)
