@@ -34,6 +34,7 @@ from quasiharmonic.apps.gradients.layers import (
     Layer,
     LayerFunctions,
     MapNotFound,
+    argument_types,
     compute_gradients,
     compute_maps,
     select_arguments,
@@ -46,7 +47,6 @@ __all__ = ["DoubtfulDerivative", "MapNotFound", "flatten", "injective_map", "qua
 # JAX passes only arrays from the forward to the backward pass. This cache keeps the last derivatives; older ones are
 # computed again from their maps.
 _MAX_RECENT = 16
-_SINGLE = np.dtype(np.float32), np.dtype(np.complex64)
 _lock = Lock()
 _recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
 
@@ -54,11 +54,10 @@ _recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
 def apply_layer(make: Callable[..., Layer], settings: tuple[Any, ...], arguments: Mapping[str, Any]) -> jax.Array:
     """Return the maps of a layer for its arguments, without those that are None; check types, devices and shapes."""
     layer = make(*settings)
-    names, given = select_arguments(layer, arguments, _check)
+    names, given, single = select_arguments(layer, arguments, _check, "astype({!r})")
     # All arrays get the same number of leading axes, so that the axis that `jax.vmap` adds is the first of each.
     axes = [np.ndim(array) - len(layer.shapes[name]) for name, array in zip(names, given, strict=True)]
     most = max(axes, default=0)
-    single = bool(given) and all(array.dtype in _SINGLE for array in given)
     arrays = (
         jnp.expand_dims(jnp.asarray(array, dtype=_find_dtype(name)), tuple(range(most - own)))
         for name, array, own in zip(names, given, axes, strict=True)
@@ -69,7 +68,7 @@ def apply_layer(make: Callable[..., Layer], settings: tuple[Any, ...], arguments
 
 def _find_dtype(name: str) -> np.dtype[Any]:
     """The type in which JAX passes an argument or ``"uv"``: double precision if enabled."""
-    found: np.dtype[Any] = jax.dtypes.canonicalize_dtype(np.complex128 if name == "mu" else np.float64)
+    found: np.dtype[Any] = jax.dtypes.canonicalize_dtype(argument_types(name)[0])
     return found
 
 
@@ -150,10 +149,7 @@ def _pull_back(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *a
 
 
 def _by_name(names: tuple[str, ...], arrays: tuple[Any, ...]) -> dict[str, Array]:
-    return {
-        name: np.asarray(array, dtype=np.complex128 if name == "mu" else np.float64)
-        for name, array in zip(names, arrays, strict=True)
-    }
+    return {name: np.asarray(array, dtype=argument_types(name)[0]) for name, array in zip(names, arrays, strict=True)}
 
 
 def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer, bytes]:
@@ -167,9 +163,6 @@ def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer,
 def _check(name: str, array: Any) -> None:
     if not isinstance(array, jax.Array | np.ndarray):
         raise TypeError(f"{name} must be an array, not {type(array).__name__}")
-    wanted = ("complex128", "complex64") if name == "mu" else ("float64", "float32")
-    if str(array.dtype) not in wanted:
-        raise TypeError(f"{name} must be of {' or '.join(wanted)}, not {array.dtype}: {name}.astype({wanted[0]!r})")
     if isinstance(array, jax.Array) and not isinstance(array, jax.core.Tracer):
         elsewhere = [device for device in array.devices() if device.platform != "cpu"]
         if elsewhere:

@@ -105,9 +105,8 @@ class Layer:
         own = {}
         for name, array in arrays.items():
             lead = array.shape[: array.ndim - len(self.shapes[name])]
-            own[name] = array[
-                tuple(0 if size == 1 else i for i, size in zip(item[len(item) - len(lead) :], lead, strict=True))
-            ]
+            last = item[len(item) - len(lead) :]
+            own[name] = array[tuple(0 if size == 1 else i for i, size in zip(last, lead, strict=True))]
         return own
 
 
@@ -209,8 +208,7 @@ def compute_gradients(
     """Return the gradients of a function of the maps (…, n, 2), by name, each with all batch axes; warn of doubts."""
     lead = cotangent.shape[:-2]
     out: dict[str, Array] = {
-        name: np.empty((*lead, *layer.shapes[name]), dtype=np.complex128 if name == "mu" else np.float64)
-        for name in wanted
+        name: np.empty((*lead, *layer.shapes[name]), dtype=argument_types(name)[0]) for name in wanted
     }
     for item, derivative in zip(np.ndindex(lead), derivatives, strict=True):
         _warn(derivative, item)
@@ -238,21 +236,33 @@ def sum_to_shape(gradient: Any, shape: tuple[int, ...]) -> Any:
     return gradient.sum(axis=short, keepdims=True) if short else gradient
 
 
+def argument_types(name: str) -> tuple[str, str]:
+    """Return the types of an argument: that of the computation, in double precision, and that in single precision."""
+    return ("complex128", "complex64") if name == "mu" else ("float64", "float32")
+
+
 def select_arguments(
-    layer: Layer, arguments: Mapping[str, Any], check: Callable[[str, Any], None]
-) -> tuple[tuple[str, ...], list[Any]]:
+    layer: Layer, arguments: Mapping[str, Any], check: Callable[[str, Any], None], conversion: str, prefix: str = ""
+) -> tuple[tuple[str, ...], list[Any], bool]:
     """Return the names and values of a layer's arguments without those that are None, with checked types and shapes.
 
-    ``check`` raises an error for the name and a wrong value. ValueError if an argument has neither one problem's shape
-    nor that with batch axes in front.
+    Also return whether all of them are in single precision. ``check`` raises an error for a value of another class or
+    device. TypeError for another type, with the call ``conversion``; ``prefix`` is that of the names of types.
+    ValueError if an argument has neither one problem's shape nor that with batch axes in front.
     """
     given = {name: array for name, array in arguments.items() if array is not None}
+    single = bool(given)
     for name, array in given.items():
         check(name, array)
+        double, short = (prefix + kind for kind in argument_types(name))
+        if str(array.dtype) not in (double, short):
+            wanted = f"{double} or {short}, not {array.dtype}: {name}.{conversion.format(double)}"
+            raise TypeError(f"{name} must be of {wanted}")
+        single &= str(array.dtype) == short
         shape, one = tuple(array.shape), layer.shapes[name]
         if len(shape) < len(one) or shape[len(shape) - len(one) :] != one:
             raise ValueError(f"{name} must have shape {one}, or batch axes before it, not {shape}")
-    return tuple(given), list(given.values())
+    return tuple(given), list(given.values()), single
 
 
 def _check_found(result: MapResult) -> FloatArray:
