@@ -185,8 +185,7 @@ def bake(old: MeshOrPath, new: MeshOrPath | UnwrapResult, **options: Unpack[Bake
         raise ValueError("a model without triangles has no look to bake")
     size = tuple(wanted.size) if isinstance(wanted.size, tuple | list) else (wanted.size, wanted.size)
     work = _Baker(before, after, size, wanted)
-    images = work.bake()
-    return replace(work.result(images), seconds=time.perf_counter() - began)
+    return work.result(work.bake(), began)
 
 
 def _as_mesh(name: str, mesh: object) -> MeshData:
@@ -343,8 +342,8 @@ class _Baker:
             flat[~covered.ravel()] = mean
             flat[texel] = beside
 
-    def result(self, images: dict[str, Bytes]) -> BakeResult:
-        """Return the result, without its time."""
+    def result(self, images: dict[str, Bytes], began: float) -> BakeResult:
+        """Return the result of a call that has ``began`` at a reading of the clock."""
         materials, jpeg = self._look.materials, self._wanted.jpeg
         colour, rough = images["colour"], images.get("metallic_roughness")
         normal, emission = images.get("normal"), images.get("emission")
@@ -368,15 +367,6 @@ class _Baker:
             alpha_cutoff=max(material.alpha_cutoff for material in materials),
             double_sided=any(material.double_sided for material in materials),
         )
-        return BakeResult(
-            replace(self._new, texture=texture),
-            colour,
-            rough,
-            normal,
-            emission,
-            self.covered,
-            self.missing,
-            self._same,
-            tuple(self.problems),
-            0.0,
-        )
+        mesh, maps = replace(self._new, texture=texture), (colour, rough, normal, emission)
+        seconds = time.perf_counter() - began
+        return BakeResult(mesh, *maps, self.covered, self.missing, self._same, tuple(self.problems), seconds)

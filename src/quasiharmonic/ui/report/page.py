@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from importlib.resources import files
 from math import isfinite, isnan
+from string import Template
 from typing import TypeAlias
 
 import numpy as np
@@ -23,6 +24,7 @@ from quasiharmonic.ui.report.statistics import PHASES, BatchRun, find_worst, qua
 from quasiharmonic.util.untrusted import parse_json
 
 STYLE = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
+_PAGE = Template(files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
 
 
 # Maximum number of problems per list of certified maps.
@@ -78,16 +80,7 @@ def _page(run: BatchRun, other: BatchRun | None) -> str:
         _gallery("Slowest certified maps", draw, _find_worst(run, "seconds")),
         _failures(run, draw),
     ]
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; "
-        'img-src data:">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark">'
-        f"<title>{title}</title><style>{STYLE}</style></head>\n<body><main>\n"
-        + "\n".join(filter(None, sections))
-        + "\n</main></body></html>\n"
-    )
+    return _PAGE.substitute(title=title, style=STYLE, sections="\n".join(filter(None, sections)))
 
 
 def escape_text(text: object) -> str:
