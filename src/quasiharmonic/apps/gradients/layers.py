@@ -36,6 +36,8 @@ from quasiharmonic.util.options import FlattenOptions, MapOptions, Options, opti
 
 #: An argument, converted to NumPy.
 Array = NDArray[Any]
+#: Tensors or arrays of a package.
+T = TypeVar("T")
 
 
 class MapNotFound(ValueError):  # noqa: N818  what it says is what happened
@@ -286,10 +288,6 @@ def _to_comparable(value: Any) -> Hashable:
     if isinstance(value, np.ndarray):
         return value.shape, value.tobytes()
     return value if isinstance(value, str | bool | int | float | None) else id(value)
-
-
-#: Tensors or arrays of a package.
-T = TypeVar("T")
 
 
 class LayerFunctions(Generic[T]):

@@ -47,6 +47,9 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.options import FlattenOptions, PolishOptions, takes
 
+# Error message for maps that are not injective.
+_NOT_FOUND = "no map was found, so there is no derivative"
+
 
 def quasi_harmonic_derivative(
     problem: Problem, mu: ArrayLike | None = None, *, reference: Reference = "equilateral", linear_solver: str = "auto"
@@ -117,10 +120,6 @@ def quasi_harmonic_derivative(
         tensors=TensorForces(field),
     )
     return Derivative(uv, equilibrium, [Doubt.CLIPPED] if clipped.any() else [])
-
-
-# Error message for maps that are not injective.
-_NOT_FOUND = "no map was found, so there is no derivative"
 
 
 class DerivativeKeywords(TypedDict, total=False):

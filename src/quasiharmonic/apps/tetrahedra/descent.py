@@ -40,6 +40,14 @@ if TYPE_CHECKING:
 _VOLUME_SHARE = 0.5
 # Pairs of vertices of a tetrahedron whose blocks are computed; the others are their transposes.
 _PAIRS = tuple((i, j) for i in range(4) for j in range(i, 4))
+# Relative residual of the linear systems, and maximum number of iterations.
+_RESIDUAL = 0.05
+_MAX_CONJUGATE_STEPS = 250
+# The regularisation parameter is kept after a step that lowers the energy by more than this share, but not more often.
+_QUICK_DECREASE = 0.1
+_MAX_REPEATED = 10
+# Least regularisation parameter; determinants are about 1.
+_MIN_EPSILON = 1e-14
 
 
 class _Density(NamedTuple):
@@ -227,15 +235,6 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
     """Inner products of vectors (3, …)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-# Relative residual of the linear systems, and maximum number of iterations.
-_RESIDUAL = 0.05
-_MAX_CONJUGATE_STEPS = 250
-# The regularisation parameter is kept after a step that lowers the energy by more than this share, but not more often.
-_QUICK_DECREASE = 0.1
-_MAX_REPEATED = 10
-_MIN_EPSILON = 1e-14
 
 
 def project(projections: FloatArray | None, x: FloatArray) -> FloatArray:

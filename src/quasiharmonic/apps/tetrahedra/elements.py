@@ -40,6 +40,13 @@ _CHUNK = 1 << 14
 _CORNERS = np.array(
     [(0, 1, 3, 4), (1, 2, 0, 5), (2, 3, 1, 6), (3, 0, 2, 7), (4, 7, 5, 0), (5, 4, 6, 1), (6, 5, 7, 2), (7, 6, 4, 3)]
 )
+#: Faces of a positive tetrahedron, counterclockwise seen from outside; face k is opposite vertex k.
+FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
+#: Edges of a tetrahedron.
+EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+_EDGES_OF_TRIANGLE = np.array([(0, 1), (1, 2), (2, 0)])
+# Vertex counts up to this have three vertices in one integer.
+_MAX_PACKED = 1 << 21
 
 
 class ExactSigns:
@@ -159,15 +166,6 @@ def find_bad_corners(H: IntArray, X: FloatArray) -> IntArray:
     """
     sign, _ = tetrahedron_signs(H[:, _CORNERS].reshape(-1, 4), X)
     return np.flatnonzero((sign.reshape(-1, 8) <= 0).any(axis=1))
-
-
-#: Faces of a positive tetrahedron, counterclockwise seen from outside; face k is opposite vertex k.
-FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
-#: Edges of a tetrahedron.
-EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
-_EDGES_OF_TRIANGLE = np.array([(0, 1), (1, 2), (2, 0)])
-# Vertex counts up to this have three vertices in one integer.
-_MAX_PACKED = 1 << 21
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,10 @@ from quasiharmonic.util.options import TetrahedraOptions
 _TOLERANCE = 1e-6
 # Least cosine between a triangle on a named plane and this plane.
 _PARALLEL = 0.9
+# Maximum number of crossing pairs of boundary triangles that are listed.
+_MAX_LISTED = 20
+# Newton steps without progress after which untangling has stalled.
+_PATIENCE = 100
 
 
 @dataclass(frozen=True)
@@ -144,12 +148,6 @@ def _snap_to_planes(
         normals[on] = normal
         named |= on
     return normals, named
-
-
-# Maximum number of crossing pairs of boundary triangles that are listed.
-_MAX_LISTED = 20
-# Newton steps without progress after which untangling has stalled.
-_PATIENCE = 100
 
 
 @dataclass(frozen=True, eq=False)

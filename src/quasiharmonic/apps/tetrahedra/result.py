@@ -23,6 +23,10 @@ from quasiharmonic.util.outcome import Outcome, as_plain
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Maximum number of obstructions of each kind.
+_MAX_LISTED = 20
+_Vector = list[Fraction]
+
 
 class TetrahedraStatus(Enum):
     """Why a search ended; the value is a message for the user."""
@@ -197,12 +201,6 @@ def tetrahedron_quality(T: IntArray, X: FloatArray) -> FloatArray:
     squares = sum(((p[:, i] - p[:, j]) ** 2).sum(axis=1) for i, j in EDGES)
     ratio = 12 * np.cbrt(3 * np.abs(volume)) ** 2 / np.where(squares > 0, squares, 1.0)
     return np.asarray(np.sign(volume) * ratio)
-
-
-# Maximum number of obstructions of each kind.
-_MAX_LISTED = 20
-
-_Vector = list[Fraction]
 
 
 def find_obstructions(

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from quasiharmonic.problem import Problem
     from quasiharmonic.targets.boundary.corner_spec import CornerSpec
 
+# A copy of the text in quasiharmonic.targets.specification, so that the parser need not import that module.
+FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
+
 
 @dataclass
 class SeamedSurface:
@@ -117,10 +120,6 @@ def read_edges(path: Path, n: int) -> NDArray[np.int64]:
             raise MeshFileError(path, f"vertex {max(ends)} of a mesh with {n}", number, "indices count from 0")
         rows.append(ends)
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
-
-
-# A copy of the text in quasiharmonic.targets.specification, so that the parser need not import that module.
-FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
 
 
 @dataclass

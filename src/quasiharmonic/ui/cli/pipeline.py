@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from quasiharmonic.geometry.exact.certificate import Certificate
     from quasiharmonic.io import MeshData
 
+# The value of --texture that needs no file.
+CHECKERBOARD = "checkerboard"
+
 
 @dataclass(frozen=True, eq=False)
 class WrittenMap:
@@ -198,10 +201,6 @@ def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str
     seconds = sum(result.seconds for result in results)
     lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
     return "\n".join(lines)
-
-
-# The value of --texture that needs no file.
-CHECKERBOARD = "checkerboard"
 
 
 @dataclass

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 NO_READER = 141
 #: Seconds between two lines of progress where standard error is not a terminal.
 LOG = 10.0
+_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 def tell(text: str) -> None:
@@ -116,9 +117,6 @@ def progress_line(
     finally:
         if terminal:
             overwrite("")
-
-
-_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 class Interrupts:

@@ -42,6 +42,7 @@ _SHORTEST = 2
 # Number of colours of a GIF's palette.
 _COLOURS = 255
 _NONE = "there are no frames"
+_COLORS = ((0.16, 0.38, 0.75), (0.06, 0.55, 0.50), (0.80, 0.50, 0.05), (0.45, 0.35, 0.75))
 
 
 @writer_accepts_mesh
@@ -226,9 +227,6 @@ def _mp4(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
                 writer.grab_frame()
 
     return encode_by("animation.mp4", write)
-
-
-_COLORS = ((0.16, 0.38, 0.75), (0.06, 0.55, 0.50), (0.80, 0.50, 0.05), (0.45, 0.35, 0.75))
 
 
 def plot_convergence(result: MapResult) -> Figure:

@@ -39,6 +39,17 @@ if TYPE_CHECKING:
 # Colours at the four corners of the view; all differ clearly from the red of inverted triangles.
 _CORNERS = np.array([[(40, 96, 190), (16, 160, 140)], [(140, 110, 230), (255, 200, 60)]]) / 255
 _LIGHT = np.array([-0.45, 0.60, 0.66])
+#: Suffixes of pictures: one raster format and two vector formats.
+PICTURES = (".png", ".svg", ".pdf")
+# Above this number of triangles vector formats get pixels too, because shapes would take megabytes.
+_MAX_SHAPES = 10_000
+#: Settings of matplotlib with which a figure is saved in its own size, whatever the user's settings are.
+AS_DRAWN: dict[Any, Any] = {"savefig.dpi": "figure", "savefig.bbox": "standard"}
+Color: TypeAlias = tuple[float, float, float]
+RED: Color = (0.89, 0.07, 0.17)
+INK: Color = (0.06, 0.12, 0.29)
+BORDER = 1.2  # width in points
+_INSIDE = np.array((0.80, 0.82, 0.86))
 
 
 @dataclass(frozen=True)
@@ -140,21 +151,6 @@ def shade(hue: FloatArray, light: FloatArray) -> FloatArray:
     gleam = 0.42 * np.maximum(strength - 0.8, 0) / 0.2
     shaded = hue * shade
     return np.asarray(np.clip(shaded + (1 - shaded) * gleam, 0, 1))
-
-
-#: Suffixes of pictures: one raster format and two vector formats.
-PICTURES = (".png", ".svg", ".pdf")
-# Above this number of triangles vector formats get pixels too, because shapes would take megabytes.
-_MAX_SHAPES = 10_000
-
-#: Settings of matplotlib with which a figure is saved in its own size, whatever the user's settings are.
-AS_DRAWN: dict[Any, Any] = {"savefig.dpi": "figure", "savefig.bbox": "standard"}
-
-Color: TypeAlias = tuple[float, float, float]
-RED: Color = (0.89, 0.07, 0.17)
-INK: Color = (0.06, 0.12, 0.29)
-BORDER = 1.2  # width in points
-_INSIDE = np.array((0.80, 0.82, 0.86))
 
 
 def new_figure(inches: tuple[float, float]) -> Figure:
