@@ -43,13 +43,12 @@ def use_options(parser: argparse.ArgumentParser, command: str) -> None:
 
 def list_options(parser: argparse.ArgumentParser, command: str) -> dict[str, str]:
     """Return the options of a subcommand by the names of their values."""
+    (subcommands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
     options = {}
-    for subcommands in parser._actions:
-        if isinstance(subcommands, argparse._SubParsersAction) and command in subcommands.choices:
-            for action in subcommands.choices[command]._actions:
-                long = [option for option in action.option_strings if option.startswith("--")]
-                if long:
-                    options[action.dest] = long[0]
+    for action in subcommands.choices[command]._actions:
+        long = [option for option in action.option_strings if option.startswith("--")]
+        if long:
+            options[action.dest] = long[0]
     return options
 
 
@@ -160,18 +159,13 @@ def name_source(source: Path | str) -> Iterator[None]:
 
     try:
         yield
-    except MeshFileError:
-        raise
     except ValueError as error:
-        if str(error).endswith(_COUNTING):
-            # An inner block has already added the prefix.
+        text = str(error)
+        if isinstance(error, MeshFileError) or text.startswith(f"{source}:") or text.endswith(_COUNTING):
+            # The error names its file, or an inner block has named it.
             raise
-        if str(error).startswith(f"{source}:"):
-            # The error already names its file.
-            raise
-        numbered = _NUMBERED.search(str(error)) and not _NEEDS_NO_NOTE.search(str(error))
-        counting = f" {_COUNTING}" if numbered else ""
-        raise ValueError(f"{source}: {error}{counting}") from error
+        numbered = _NUMBERED.search(text) and not _NEEDS_NO_NOTE.search(text)
+        raise ValueError(f"{source}: {text}{f' {_COUNTING}' if numbered else ''}") from error
 
 
 def describe_error(error: Exception) -> str:

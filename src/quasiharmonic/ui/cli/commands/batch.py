@@ -232,9 +232,7 @@ def _write_report(options: argparse.Namespace) -> int:
     folder = output if output.is_dir() else output.parent
     page = folder / "report.html"
     write_report(page, output, options.against)
-    with report.after_writing(page):
-        print(f"wrote {page}", flush=True)
-    return 0
+    return report.tell_written(page)
 
 
 def _account(progress: Progress, wanted: str, table: str) -> str:
