@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import process, report
+from quasiharmonic.util.outcome import as_plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -86,12 +87,9 @@ class WrittenMap:
         """Return the verdict as the first entries of the JSON report."""
         apart = {} if self.verdict is None else {k: self.verdict.to_dict()[k] for k in ("islands", "overlapping")}
         return {
-            "injective": self.injective,
-            "bijective": self.bijective,
-            "inverted": self.certificate.inverted.tolist(),
-            "degenerate": self.certificate.degenerate.tolist(),
-            "faces": self.faces,
-            "certificate": self.certificate.to_dict(),
+            **as_plain(self, "injective", "bijective"),
+            **as_plain(self.certificate, "inverted", "degenerate"),
+            **as_plain(self, "faces", "certificate"),
             **({"verdict": apart} if apart else {}),
             "bent_faces": self.bent.tolist(),
             **({} if self.set_apart is None else self.set_apart.to_dict()),
