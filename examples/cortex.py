@@ -25,7 +25,7 @@ from common import INK, RED, FloatArray, colorbar, panels, run, save
 from quasiharmonic import certify, distortion, flatten, keep_distances
 from quasiharmonic.energies.distances import SurfaceDistances, surface_distances
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.ui.plot.canvas import shade
 from quasiharmonic.util.arrays import IntArray
 
 # Colours from the crowns of the gyri to the bottoms of the sulci.
@@ -121,7 +121,7 @@ def show_surface(ax: Axes, brain: Cortex, side: int, color: FloatArray, *, cuts:
     hue[place >= 0] = color[place[place >= 0]]
     front = np.flatnonzero(side * normal[:, 0] > 0)
     front = front[np.argsort(towards[brain.whole[front]].mean(axis=1))]
-    shades = lit(hue, light)[front]
+    shades = shade(hue, light)[front]
     ax.add_collection(PolyCollection(points[brain.whole[front]], facecolors=shades, edgecolors="face", lw=0.3))
     if cuts:
         ends = brain.number[boundary_edges(brain.F, len(brain.V))]

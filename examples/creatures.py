@@ -19,7 +19,7 @@ from matplotlib.colors import LogNorm
 from common import INK, FloatArray, colorbar, panels, run, save
 from quasiharmonic import cut_open, distortion, find_cuts, flatten
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys
-from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.ui.plot.canvas import shade
 from quasiharmonic.util.arrays import IntArray
 from sculptures import creature
 
@@ -41,7 +41,7 @@ def show_creature(
     seen = V @ (from_above @ from_side).T
     normal = np.cross(seen[F[:, 1]] - seen[F[:, 0]], seen[F[:, 2]] - seen[F[:, 0]])
     normal /= np.linalg.norm(normal, axis=1)[:, None]
-    shades = lit(color, normal @ (np.array([-0.45, 0.6, 0.66]) / np.linalg.norm((0.45, 0.6, 0.66))))
+    shades = shade(color, normal @ (np.array([-0.45, 0.6, 0.66]) / np.linalg.norm((0.45, 0.6, 0.66))))
     marked = np.isin(edge_keys(F, np.roll(F, -1, axis=1), len(V)), edge_keys(cut[:, 0], cut[:, 1], len(V)))
     # Paint from back to front, lines slightly before their triangles, so that nearer parts hide farther ones.
     front = np.flatnonzero(normal[:, 2] > 0)

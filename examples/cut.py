@@ -23,7 +23,7 @@ from common import RED, FloatArray, panels, run, save
 from quasiharmonic import io
 from quasiharmonic.plot import plot_map, plot_surface
 from quasiharmonic.ui.cli import main as qhm
-from quasiharmonic.ui.plot.shading import view
+from quasiharmonic.ui.plot.canvas import view
 
 Mesh = tuple[FloatArray, NDArray[np.int64]]
 

@@ -15,7 +15,7 @@ from matplotlib.collections import LineCollection
 from common import RED, panels, run, save
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.plot import plot_surface
-from quasiharmonic.ui.plot.shading import view
+from quasiharmonic.ui.plot.canvas import view
 from sculptures import SCULPTURES, sculpture
 
 

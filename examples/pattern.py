@@ -19,7 +19,7 @@ from common import INK, FloatArray, colorbar, panels, run, save
 from quasiharmonic import distortion, flatten, surfaces, write_pattern
 from quasiharmonic.apps.flattening.patterns import pattern
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
-from quasiharmonic.ui.plot.shading import lit
+from quasiharmonic.ui.plot.canvas import shade
 from quasiharmonic.util.arrays import IntArray
 
 LENGTH, ALLOWANCE, GAP = 300.0, 7.0, 20.0
@@ -118,7 +118,7 @@ def show_body(ax: Axes, parts: list[Panel]) -> None:
         front = normal @ towards > 0
         light = normal[front] @ (np.array([-0.3, -0.6, 0.75]) / np.linalg.norm([0.3, 0.6, 0.75]))
         triangles.append(corners[front] @ frame.T)
-        colors.append(lit(np.tile(BACK if k < 2 else BELLY, (light.size, 1)), light))
+        colors.append(shade(np.tile(BACK if k < 2 else BELLY, (light.size, 1)), light))
         depth.append(corners[front].mean(axis=1) @ towards)
         ends = boundary_edges(part.F, len(part.V))
         seen = np.isin(ends, part.F[front]).all(axis=1)

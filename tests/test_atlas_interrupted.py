@@ -10,7 +10,7 @@ import pytest
 from quasiharmonic import atlas, io
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.surfaces import disk
-from quasiharmonic.ui.cli import main, streams
+from quasiharmonic.ui.cli import main, process
 from shared.meshes import lift
 
 
@@ -79,7 +79,7 @@ def test_the_command_writes_an_injective_map(tmp_path, monkeypatch, capsys, comm
     io.write_mapped(tmp_path / "in.obj", io.MeshData(mesh.V, mesh.F).with_places(mesh))
     for count in (5, 12):
         call = interrupting(count)
-        monkeypatch.setattr(streams, "progress_line", lambda *_, call=call: Shown(call))
+        monkeypatch.setattr(process, "progress_line", lambda *_, call=call: Shown(call))
         status = main([command, str(tmp_path / "in.obj"), "-o", str(tmp_path / "out.obj")])
         said = capsys.readouterr()
         if status == 2:

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from quasiharmonic.ui.cli import main, streams
+from quasiharmonic.ui.cli import main, process
 from quasiharmonic.ui.cli.commands import batch
 from shared.datasets import write_stars
 
@@ -65,7 +65,7 @@ class TestCommand:
         pty = pytest.importorskip("pty")
         # Print every problem, however fast they follow each other.
         monkeypatch.setattr(batch, "LIVE", 0)
-        monkeypatch.setattr(streams, "LOG", 0)
+        monkeypatch.setattr(process, "LOG", 0)
         command = ["batch", str(stars), "-j", "1", "-o"]
         leader, follower = pty.openpty()
         with os.fdopen(follower, "w") as terminal, monkeypatch.context() as patch:

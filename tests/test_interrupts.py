@@ -16,7 +16,7 @@ import pytest
 import quasiharmonic
 from quasiharmonic import io
 from quasiharmonic.surfaces import cat
-from quasiharmonic.ui.cli import main, streams
+from quasiharmonic.ui.cli import main, process
 from quasiharmonic.ui.cli.commands import measure
 
 # Calls the command in a process and interrupts it when a module with a given name is imported.
@@ -53,7 +53,7 @@ def interrupted(at, *arguments):
         "argparse",
         "quasiharmonic.ui.cli",
         "quasiharmonic.ui.cli.commands.map",
-        "quasiharmonic.ui.cli.targets",
+        "quasiharmonic.ui.cli.map_options",
         "quasiharmonic.io",
     ],
 )
@@ -196,7 +196,7 @@ def test_sigterm_keeps_the_map(tmp_path, monkeypatch, capsys):
 
         yield show
 
-    monkeypatch.setattr(streams, "progress_line", line)
+    monkeypatch.setattr(process, "progress_line", line)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         assert main(["flatten", str(tmp_path / "in.obj"), "-o", str(tmp_path / "out.obj")]) == 0

@@ -20,7 +20,7 @@ from quasiharmonic.linsolve import BACKENDS
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
 from quasiharmonic.solver.search import harmonising, stages
-from quasiharmonic.ui.cli.arguments import add_options, declared
+from quasiharmonic.ui.cli.arguments import add_options, declare_options
 from quasiharmonic.util import options
 from quasiharmonic.util.options import (
     AnimationOptions,
@@ -174,7 +174,7 @@ def test_numbers_of_the_command_line_have_the_type_of_their_field():
         speed: float | None = option(None, "how fast", check=options.seconds)
 
     parser = argparse.ArgumentParser(exit_on_error=False)
-    add_options(parser, **declared(Dive))
+    add_options(parser, **declare_options(Dive))
     given = parser.parse_args(["--depth", "2", "--stops", "0", "--divers", "4", "--speed", "5"])
     assert [type(value) for value in vars(given).values()] == [int, int, int, float]
     assert parser.parse_args([]).divers is None

@@ -159,6 +159,6 @@ def test_options_of_outlines():
 
 def test_the_command_lists_the_outlines_of_the_library():
     from quasiharmonic.targets import specification
-    from quasiharmonic.ui.cli.targets import FORMS
+    from quasiharmonic.ui.cli.map_options import FORMS
 
     assert FORMS == specification.FORMS

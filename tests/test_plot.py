@@ -28,9 +28,8 @@ from quasiharmonic.plot import (
 from quasiharmonic.targets.boundary.correspondence import viewer_axes
 from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.plot import interactive
-from quasiharmonic.ui.plot.canvas import RED, new_figure
+from quasiharmonic.ui.plot.canvas import RED, new_figure, view
 from quasiharmonic.ui.plot.distortion import LABELS
-from quasiharmonic.ui.plot.shading import view
 
 
 def pixels(figure):

@@ -9,7 +9,7 @@ import pytest
 
 from quasiharmonic import certify_tetrahedra
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
-from quasiharmonic.apps.tetrahedra.signs import ExactSigns, tetrahedron_signs
+from quasiharmonic.apps.tetrahedra.elements import ExactSigns, tetrahedron_signs
 from quasiharmonic.io.fem.files import read_volume
 from quasiharmonic.ui.cli import main
 from shared.exact_space import contact, cross, determinant, dot, exact, minus, overlap

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import BoundaryCurves, MovingMesh, certify_tetrahedra, morph
-from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
+from quasiharmonic.apps.tetrahedra.descent import ShapeEnergy
 from quasiharmonic.apps.tetrahedra.result import TetrahedraStatus
 from quasiharmonic.io.fem.files import read_volume
 from quasiharmonic.ui.cli import main

@@ -42,9 +42,9 @@ from .apps.flattening.distances.distance_descent import keep_distances as keep_d
 from .apps.flattening.free_boundary import flatten as flatten
 from .apps.flattening.patterns import write_pattern as write_pattern
 from .apps.gradients.derivative import Derivative as Derivative
-from .apps.gradients.flatten_gradient import flatten_derivative as flatten_derivative
-from .apps.gradients.polish_gradient import polish_derivative as polish_derivative
-from .apps.gradients.tensors import quasi_harmonic_derivative as quasi_harmonic_derivative
+from .apps.gradients.map_derivatives import flatten_derivative as flatten_derivative
+from .apps.gradients.map_derivatives import polish_derivative as polish_derivative
+from .apps.gradients.map_derivatives import quasi_harmonic_derivative as quasi_harmonic_derivative
 from .apps.inverse.inverse_map import InverseMap as InverseMap
 from .apps.inverse.transfer import SurfaceMap as SurfaceMap
 from .apps.mesh_motion.morph_result import MorphResult as MorphResult

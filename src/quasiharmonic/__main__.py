@@ -26,7 +26,7 @@ def main() -> int:
         # An interrupt that came out of an `exec`, as of a dataclass while it is loaded, counts as unhandled, and would
         # end the process by a signal in place of its status, until another one runs through.
         exec("")
-    from quasiharmonic.ui.cli.streams import finish
+    from quasiharmonic.ui.cli.process import finish
 
     return finish(status)
 

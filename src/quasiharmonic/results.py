@@ -15,8 +15,7 @@ from quasiharmonic.apps.displacement_fields.field_inversion import InverseField
 from quasiharmonic.apps.displacement_fields.nearest import InvertibleField
 from quasiharmonic.apps.displacement_fields.voxels import InverseVolume, InvertibleVolume, VoxelVerdict
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.inverse.chart_inverse import ChartInverse
-from quasiharmonic.apps.inverse.inverse_map import SurfacePoints
+from quasiharmonic.apps.inverse.inverse_map import ChartInverse, SurfacePoints
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
 from quasiharmonic.apps.repair.uv_repair import RepairedIsland, RepairResult
 from quasiharmonic.apps.tetrahedra.certificate import TetrahedraCertificate

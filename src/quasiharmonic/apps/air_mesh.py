@@ -33,8 +33,8 @@ from quasiharmonic.util.arrays import (
     check_positive,
     describe,
     map_array,
-    names_of,
     real_array,
+    reject,
     triangle_array,
 )
 from quasiharmonic.util.optional import explain_missing
@@ -116,11 +116,9 @@ class AirMesh:
         self._rest = map_array("points", points)
         self._F = triangle_array(F, len(self._rest))
         idle = np.setdiff1d(np.arange(len(self._rest)), self._F)
-        if idle.size:
-            raise ValueError(f"no triangle uses {names_of('vertex', 'vertices', idle)}: remove unused vertices")
-        turned = np.flatnonzero(orientation(*(self._rest[self._F[:, k]] for k in range(3))) <= 0)
-        if turned.size:
-            raise ValueError(f"{names_of('triangle', 'triangles', turned)} not counterclockwise")
+        reject(idle, "vertex", "vertices", "no triangle uses {}: remove unused vertices")
+        turned = orientation(*(self._rest[self._F[:, k]] for k in range(3))) <= 0
+        reject(turned, "triangle", "triangles", "{} not counterclockwise")
         check_numbers(air_weight=air_weight)
         if not 0 < air_weight <= 1:
             raise ValueError(f"air_weight must be above 0 and at most 1, not {air_weight}")

@@ -28,12 +28,13 @@ with explain_missing("quasiharmonic.jax needs JAX", extra="jax"):
 import numpy as np
 
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.layer_functions import LayerFunctions
 from quasiharmonic.apps.gradients.layers import (
     Array,
     DoubtfulDerivative,
     Layer,
+    LayerFunctions,
     MapNotFound,
+    argument_types,
     compute_gradients,
     compute_maps,
     select_arguments,
@@ -46,7 +47,6 @@ __all__ = ["DoubtfulDerivative", "MapNotFound", "flatten", "injective_map", "qua
 # JAX passes only arrays from the forward to the backward pass. This cache keeps the last derivatives; older ones are
 # computed again from their maps.
 _MAX_RECENT = 16
-_SINGLE = np.dtype(np.float32), np.dtype(np.complex64)
 _lock = Lock()
 _recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
 
@@ -54,22 +54,21 @@ _recent: OrderedDict[tuple[Layer, bytes], Derivative] = OrderedDict()
 def apply_layer(make: Callable[..., Layer], settings: tuple[Any, ...], arguments: Mapping[str, Any]) -> jax.Array:
     """Return the maps of a layer for its arguments, without those that are None; check types, devices and shapes."""
     layer = make(*settings)
-    names, given = select_arguments(layer, arguments, _check)
+    names, given, single = select_arguments(layer, arguments, _check, "astype({!r})")
     # All arrays get the same number of leading axes, so that the axis that `jax.vmap` adds is the first of each.
     axes = [np.ndim(array) - len(layer.shapes[name]) for name, array in zip(names, given, strict=True)]
     most = max(axes, default=0)
-    single = bool(given) and all(array.dtype in _SINGLE for array in given)
     arrays = (
-        jnp.expand_dims(jnp.asarray(array, dtype=_widest(name)), tuple(range(most - own)))
+        jnp.expand_dims(jnp.asarray(array, dtype=_find_dtype(name)), tuple(range(most - own)))
         for name, array, own in zip(names, given, axes, strict=True)
     )
     maps: jax.Array = _map(layer, names, *arrays)
     return maps.astype(np.float32) if single else maps
 
 
-def _widest(name: str) -> np.dtype[Any]:
+def _find_dtype(name: str) -> np.dtype[Any]:
     """The type in which JAX passes an argument or ``"uv"``: double precision if enabled."""
-    found: np.dtype[Any] = jax.dtypes.canonicalize_dtype(np.complex128 if name == "mu" else np.float64)
+    found: np.dtype[Any] = jax.dtypes.canonicalize_dtype(argument_types(name)[0])
     return found
 
 
@@ -87,7 +86,7 @@ class _Call:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _map(layer: Layer, names: tuple[str, ...], *arrays: jax.Array) -> jax.Array:
-    shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.map_shape), _widest("uv"))
+    shape = jax.ShapeDtypeStruct((*_lead(layer, names, arrays), *layer.map_shape), _find_dtype("uv"))
     maps: jax.Array = jax.pure_callback(_Call(_compute, layer, names), shape, *arrays, vmap_method="expand_dims")
     return maps
 
@@ -123,7 +122,7 @@ def _compute(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
     """Compute the maps, and cache their derivatives."""
     given = _by_name(names, arrays)
     exact, derivatives = compute_maps(layer, given)
-    uv = exact.astype(_widest("uv"))
+    uv = exact.astype(_find_dtype("uv"))
     with _lock:
         for item, derivative in zip(np.ndindex(uv.shape[:-2]), derivatives, strict=True):
             _recent[_key(layer, layer.item(given, item), uv[item].astype(np.float64))] = derivative
@@ -146,14 +145,11 @@ def _pull_back(layer: Layer, names: tuple[str, ...], uv: Any, cotangent: Any, *a
         derivatives.append(derivative or layer.derivative(own, uv[item]))
     found = compute_gradients(layer, derivatives, cotangent, names)
     # JAX's convention is ∂/∂Re − i ∂/∂Im.
-    return [found[name].conj().astype(_widest(name)) for name in names]
+    return [found[name].conj().astype(_find_dtype(name)) for name in names]
 
 
 def _by_name(names: tuple[str, ...], arrays: tuple[Any, ...]) -> dict[str, Array]:
-    return {
-        name: np.asarray(array, dtype=np.complex128 if name == "mu" else np.float64)
-        for name, array in zip(names, arrays, strict=True)
-    }
+    return {name: np.asarray(array, dtype=argument_types(name)[0]) for name, array in zip(names, arrays, strict=True)}
 
 
 def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer, bytes]:
@@ -167,9 +163,6 @@ def _key(layer: Layer, own: Mapping[str, Array], uv: FloatArray) -> tuple[Layer,
 def _check(name: str, array: Any) -> None:
     if not isinstance(array, jax.Array | np.ndarray):
         raise TypeError(f"{name} must be an array, not {type(array).__name__}")
-    wanted = ("complex128", "complex64") if name == "mu" else ("float64", "float32")
-    if str(array.dtype) not in wanted:
-        raise TypeError(f"{name} must be of {' or '.join(wanted)}, not {array.dtype}: {name}.astype({wanted[0]!r})")
     if isinstance(array, jax.Array) and not isinstance(array, jax.core.Tracer):
         elsewhere = [device for device in array.devices() if device.platform != "cpu"]
         if elsewhere:

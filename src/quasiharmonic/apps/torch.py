@@ -20,12 +20,13 @@ with explain_missing("quasiharmonic.torch needs PyTorch", extra="torch"):
     from torch.autograd.function import once_differentiable
 
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.layer_functions import LayerFunctions
 from quasiharmonic.apps.gradients.layers import (
     Array,
     DoubtfulDerivative,
     Layer,
+    LayerFunctions,
     MapNotFound,
+    argument_types,
     compute_changes,
     compute_gradients,
     compute_maps,
@@ -35,8 +36,6 @@ from quasiharmonic.apps.gradients.layers import (
 
 __all__ = ["DoubtfulDerivative", "MapNotFound", "flatten", "injective_map", "quasi_harmonic_map"]
 
-# Types of real arguments, and of ``mu``; the first is that of the computation.
-_DTYPES = (torch.float64, torch.float32), (torch.complex128, torch.complex64)
 _COMPILED = "maps are computed by NumPy and SciPy, so torch.compile breaks the graph here"
 
 
@@ -49,9 +48,8 @@ def apply_layer(
     The layer is made from its settings here, because `torch.compile` does not follow this function.
     """
     layer = make(*settings)
-    names, tensors = select_arguments(layer, arguments, _check)
-    single = bool(tensors) and all(tensor.dtype in (torch.float32, torch.complex64) for tensor in tensors)
-    wide = (tensor.to(_DTYPES[name == "mu"][0]) for name, tensor in zip(names, tensors, strict=True))
+    names, tensors, single = select_arguments(layer, arguments, _check, "to({})", prefix="torch.")
+    wide = (tensor.to(getattr(torch, argument_types(name)[0])) for name, tensor in zip(names, tensors, strict=True))
     maps: torch.Tensor = _Map.apply(layer, names, *wide)[0]
     return maps.float() if single else maps
 
@@ -121,11 +119,8 @@ def _numpy(tensor: torch.Tensor) -> Array:
 
 
 def _check(name: str, tensor: Any) -> None:
-    wanted = _DTYPES[name == "mu"]
     if not isinstance(tensor, torch.Tensor):
         raise TypeError(f"{name} must be a tensor, not {type(tensor).__name__}")
-    if tensor.dtype not in wanted:
-        raise TypeError(f"{name} must be of {wanted[0]} or {wanted[1]}, not {tensor.dtype}: {name}.to({wanted[0]})")
     if tensor.device.type != "cpu":
         raise ValueError(f"{name} is on {tensor.device}, but maps are computed on the CPU: {name}.cpu()")
 

@@ -340,6 +340,16 @@ def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
         raise ValueError(f"{name} is not finite at {names_of(one, many, np.flatnonzero(~finite.all(axis=1)))}")
 
 
+def reject(found: BoolArray | IntArray, one: str, many: str, message: str) -> None:
+    """Raise a ValueError if there are elements in a mask (n,) or an array of indices.
+
+    The message has their names, made of ``one`` and ``many``, in place of ``{}``.
+    """
+    indices = np.flatnonzero(found) if found.dtype == np.bool_ else found.astype(np.int64)
+    if indices.size:
+        raise ValueError(message.format(names_of(one, many, indices)))
+
+
 def check_range(
     name: str, indices: IntArray, n: int, one: str = "vertex", many: str = "vertices", *, minimum: int = 0
 ) -> None:

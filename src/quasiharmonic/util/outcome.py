@@ -5,6 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 
+def as_plain(owner: object, *names: str) -> dict[str, Any]:
+    """Return attributes by name, fit for JSON: arrays as lists, and objects with ``to_dict`` as dictionaries."""
+    return {name: _make_plain(getattr(owner, name)) for name in names}
+
+
+def _make_plain(value: Any) -> Any:
+    for convert in ("tolist", "to_dict"):
+        if hasattr(value, convert):
+            return getattr(value, convert)()
+    return value
+
+
 class Verdict:
     """Base of certificates: an exact verdict on stored positions.
 
@@ -26,7 +38,7 @@ class Verdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
-        return {"valid": self.valid, "bijective": self.bijective}
+        return as_plain(self, "valid", "bijective")
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.summary().partition(chr(10))[0]}>"
@@ -89,10 +101,7 @@ class Outcome(BaseOutcome):
         return {
             "success": self.success,
             "status": self.status.name.lower(),
-            "message": self.message,
-            "n_iterations": self.n_iterations,
-            "seconds": self.seconds,
-            "certificate": self.certificate.to_dict(),
+            **as_plain(self, "message", "n_iterations", "seconds", "certificate"),
         }
 
 

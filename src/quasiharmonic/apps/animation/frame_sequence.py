@@ -36,8 +36,6 @@ from quasiharmonic.util.progress import reports_progress
 _SOON = 6
 # Step length, a fifth of the usual first steps: if these fail, short ones lead less far away.
 _SHORT_STEPS = ((0, 0.1),)
-# Maximum number of halvings of the way from the last boundary to the next.
-_HALVINGS = 3
 # Default maximum vertex displacement, relative to the maximum boundary displacement.
 _LIMIT = 3.0
 
@@ -90,7 +88,7 @@ class FrameSearch:
                 return near
             if near.diagnosis is not None and near.diagnosis.forbids_injective:
                 return replace(near, status=Status.IMPOSSIBLE)
-            by_halves = None if last is None else self._search_by_halves(target, start, last, _HALVINGS)
+            by_halves = None if last is None else self._search_by_halves(target, start, last, times=3)
             if by_halves is not None:
                 return by_halves
         return self._solve(problem, start, self._options.max_iterations)

@@ -11,17 +11,9 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.util.arrays import (
-    BoolArray,
-    FloatArray,
-    check_finite,
-    count_of,
-    describe,
-    names_of,
-    real_array,
-)
+from quasiharmonic.util.arrays import BoolArray, FloatArray, check_finite, count_of, describe, names_of, real_array
 from quasiharmonic.util.optional import make_dataframe
-from quasiharmonic.util.outcome import SummarisedOutcome, Verdict
+from quasiharmonic.util.outcome import SummarisedOutcome, Verdict, as_plain
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -230,8 +222,7 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
             "overlapping": np.flatnonzero(self.found & ~self.bijective).tolist(),
             "missing": np.flatnonzero(~self.found).tolist(),
             "bridged": np.flatnonzero(self.bridged).tolist(),
-            "interrupted": self.interrupted,
-            "largest_move": self.largest_move,
+            **as_plain(self, "interrupted", "largest_move"),
             "moves": [None if np.isnan(move) else float(move) for move in self.moves],
             "mean_energies": [None if np.isnan(energy) else float(energy) for energy in self.energies],
             "statuses": [frame.status.name.lower() for frame in self.frames],

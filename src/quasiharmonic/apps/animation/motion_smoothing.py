@@ -48,10 +48,6 @@ _SWEEP_GROWTH = 1.5
 # Moves within this fraction of the limit cost nothing in a sweep.
 _FREE_SHARE = 0.9
 _SWEEPS = 40
-# Newton steps per frame in the forward pass.
-_FORWARD_STEPS = 60
-# Newton steps per frame in a sweep.
-_SWEEP_STEPS = 20
 _TOLERANCE = 1e-4
 
 
@@ -147,7 +143,7 @@ class MotionSmoothing:
             self._lengths.append(find_longest(uv[fixed] - self.maps[-1][fixed]))
             before = [Neighbour(self.maps[-1], self._lengths[-1])]
         weight = _PROXIMAL_WEIGHT * max(_MIN_ENERGY, self.energies[-1] if self.energies else 0.0)
-        lowered, energy = self._lower(uv, before, ProximalPenalty(weight, _FREE_MOTION), _FORWARD_STEPS)
+        lowered, energy = self._lower(uv, before, ProximalPenalty(weight, _FREE_MOTION), steps=60)
         self.maps.append(lowered)
         self.energies.append(energy)
         if before:
@@ -178,9 +174,7 @@ class MotionSmoothing:
                 if any(self._moves[one] > self._limit for one in beside):
                     report(sweep, t)
                     penalty = ProximalPenalty(weight, _FREE_SHARE * self._limit)
-                    self.maps[t], self.energies[t] = self._lower(
-                        self.maps[t], self._neighbours(t), penalty, _SWEEP_STEPS
-                    )
+                    self.maps[t], self.energies[t] = self._lower(self.maps[t], self._neighbours(t), penalty, steps=20)
                     for one in beside:
                         self._measure(one)
             weight *= _SWEEP_GROWTH

@@ -11,8 +11,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from quasiharmonic.apps.baking.images import Bytes, encode, find_sources, to_bytes
-from quasiharmonic.apps.baking.look import SurfaceLook
-from quasiharmonic.apps.baking.tangents import TangentFrames, tangent_frames
+from quasiharmonic.apps.baking.look import SurfaceLook, TangentFrames, tangent_frames
 from quasiharmonic.apps.unwrapping.model_files import add_map
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.geometry.mesh.point_queries import NearestPoint, Raster
@@ -23,7 +22,7 @@ from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.models.textures import MaterialTextures
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, describe
 from quasiharmonic.util.options import BakeOptions, takes
-from quasiharmonic.util.outcome import BaseOutcome
+from quasiharmonic.util.outcome import BaseOutcome, as_plain
 
 #: Colour of texels that are too far from the old model, 8-bit sRGB.
 MISSING = (255, 0, 255)
@@ -112,16 +111,12 @@ class BakeResult(BaseOutcome):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report for JSON, without the images."""
+        height, width = self.colour.shape[:2]
         return {
-            "success": self.success,
-            "message": self.message,
-            "size": [self.colour.shape[1], self.colour.shape[0]],
-            "metallic_roughness": self.metallic_roughness is not None,
-            "normal": self.normal is not None,
-            "emission": self.emission is not None,
-            "covered": self.covered,
-            "missing": self.missing,
-            "same_mesh": self.same_mesh,
+            **as_plain(self, "success", "message"),
+            "size": [width, height],
+            **{name: getattr(self, name) is not None for name in ("metallic_roughness", "normal", "emission")},
+            **as_plain(self, "covered", "missing", "same_mesh"),
             "problems": list(self.problems),
             "seconds": self.seconds,
         }
@@ -189,8 +184,7 @@ def bake(old: MeshOrPath, new: MeshOrPath | UnwrapResult, **options: Unpack[Bake
         raise ValueError("a model without triangles has no look to bake")
     size = tuple(wanted.size) if isinstance(wanted.size, tuple | list) else (wanted.size, wanted.size)
     work = _Baker(before, after, size, wanted)
-    images = work.bake()
-    return replace(work.result(images), seconds=time.perf_counter() - began)
+    return work.result(work.bake(), began)
 
 
 def _as_mesh(name: str, mesh: object) -> MeshData:
@@ -211,7 +205,7 @@ class _Baker:
     """The work of one call: the rows of the new texture, block by block."""
 
     def __init__(self, old: MeshData, new: MeshData, size: tuple[int, int], wanted: BakeOptions) -> None:
-        self._old, self._new, self._wanted = old, new, wanted
+        self._new, self._wanted = new, wanted
         self._width, self._height = size
         self._look = SurfaceLook(read_appearance(old))
         self.problems = self._look.problems
@@ -224,7 +218,8 @@ class _Baker:
         self._raster = self._make_raster(uv)
         self._frames: tuple[TangentFrames, TangentFrames] | None = None
         if self._look.has("normal"):
-            self._frames = self._old_frames(), tangent_frames(new, uv)
+            coordinates = self._look.normal_coordinates() * [1, -1] + [0, 1]
+            self._frames = tangent_frames(old, coordinates), tangent_frames(new, uv)
         materials = self._look.materials
         self._strength = max([1.0, *(value for material in materials for value in material.emission)])
 
@@ -248,11 +243,6 @@ class _Baker:
         scale = np.array([self._width, -self._height]) * samples
         placed = np.nan_to_num(uv * scale + [0, self._height * samples])
         return Raster(placed, self._width * samples, self._height * samples, degenerate | bare)
-
-    def _old_frames(self) -> TangentFrames:
-        """Return the frames of the normal maps of the old model."""
-        coordinates = self._look.normal_coordinates()
-        return tangent_frames(self._old, coordinates * [1, -1] + [0, 1])
 
     def bake(self) -> dict[str, Bytes]:
         """Return the images by name, and what is covered, as ``covered``."""
@@ -351,8 +341,8 @@ class _Baker:
             flat[~covered.ravel()] = mean
             flat[texel] = beside
 
-    def result(self, images: dict[str, Bytes]) -> BakeResult:
-        """Return the result, without its time."""
+    def result(self, images: dict[str, Bytes], began: float) -> BakeResult:
+        """Return the result of a call that has ``began`` at a reading of the clock."""
         materials, jpeg = self._look.materials, self._wanted.jpeg
         colour, rough = images["colour"], images.get("metallic_roughness")
         normal, emission = images.get("normal"), images.get("emission")
@@ -376,15 +366,6 @@ class _Baker:
             alpha_cutoff=max(material.alpha_cutoff for material in materials),
             double_sided=any(material.double_sided for material in materials),
         )
-        return BakeResult(
-            replace(self._new, texture=texture),
-            colour,
-            rough,
-            normal,
-            emission,
-            self.covered,
-            self.missing,
-            self._same,
-            tuple(self.problems),
-            0.0,
-        )
+        mesh, maps = replace(self._new, texture=texture), (colour, rough, normal, emission)
+        seconds = time.perf_counter() - began
+        return BakeResult(mesh, *maps, self.covered, self.missing, self._same, tuple(self.problems), seconds)

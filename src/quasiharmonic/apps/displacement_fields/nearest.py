@@ -36,7 +36,7 @@ from quasiharmonic.apps.displacement_fields.voxels import (
     in_units,
     nearest_invertible_volume,
 )
-from quasiharmonic.apps.tetrahedra.energy import cross
+from quasiharmonic.apps.tetrahedra.descent import cross
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, check_choice, count_of
@@ -81,11 +81,6 @@ def least_coefficients(grid: VoxelGrid, field: FloatArray) -> FloatArray:
     return least
 
 
-def trilinear_fold_free(grid: VoxelGrid, field: FloatArray) -> BoolArray:
-    """Return the cells (d − 1, h − 1, w − 1) whose determinant is certainly positive everywhere."""
-    return np.asarray(least_coefficients(grid, field) > 0)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class InvertibleField(NearestField):
     """A displacement field without folds, and its distance from the given one.
@@ -127,11 +122,7 @@ class InvertibleField(NearestField):
 
 
 def nearest_invertible(
-    field: ArrayLike,
-    *,
-    spacing: ArrayLike = 1.0,
-    min_jacobian: float = 0.01,
-    fixed: ArrayLike | None = None,
+    field: ArrayLike, *, spacing: ArrayLike = 1.0, min_jacobian: float = 0.01, fixed: ArrayLike | None = None
 ) -> InvertibleField | InvertibleVolume:
     """Make a displacement field invertible with a minimum change.
 
@@ -229,7 +220,7 @@ def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0, interpolation: str 
     if np.ndim(field) == 4:
         volume, scaled, _ = in_units(check_field(field), spacing)
         if interpolation == "trilinear":
-            return trilinear_fold_free(volume, scaled)
+            return np.asarray(least_coefficients(volume, scaled) > 0)
         return ~find_folded_cells(volume, scaled, None)
     if interpolation != "linear":
         raise ValueError("trilinear interpolation is that of volumes: omit interpolation")

@@ -32,10 +32,8 @@ from quasiharmonic.apps.displacement_fields.grid import (
     name_points,
 )
 from quasiharmonic.apps.tetrahedra.contacts import find_contacts
-from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
-from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy, cross, dot
-from quasiharmonic.apps.tetrahedra.signs import ExactSigns
-from quasiharmonic.apps.tetrahedra.topology import inspect_faces
+from quasiharmonic.apps.tetrahedra.descent import ShapeEnergy, TetrahedraDescent, cross, dot
+from quasiharmonic.apps.tetrahedra.elements import ExactSigns, inspect_faces
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each
 from quasiharmonic.util.outcome import Verdict
 from quasiharmonic.util.progress import heartbeat
@@ -44,8 +42,6 @@ from quasiharmonic.util.progress import heartbeat
 _ORDERS = tuple((p, int(np.linalg.det(np.eye(3)[list(p)]).round())) for p in permutations(range(3)))
 # Distance in voxels around folded cells that becomes free; factor of it for patches that still fold; rounds.
 _MARGIN, _GROWTH, _MAX_ROUNDS = 2, 2, 5
-# Newton steps that untangle a patch, and that lower the distance for each weight of the energy.
-_UNTANGLING_STEPS, _STEPS = 200, 8
 # Weights of the energy relative to the squared distance, in voxels.
 _WEIGHTS = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
 # Voxels closer than this to their original position, in voxels, return to it.
@@ -289,11 +285,11 @@ def _repair_patch(
     energy = ShapeEnergy(T, rest, floor=min(_AIM * min_jacobian + 1e-9, 0.99))
     descent = TetrahedraDescent(energy, free, before, anchor=(before, 1.0 / len(T)))
     with np.errstate(all="ignore"):
-        if not descent.make_valid(_UNTANGLING_STEPS):
+        if not descent.make_valid(max_steps=200):
             return False
         for weight in _WEIGHTS:
             descent.anchor = before, 1.0 / (weight * len(T))
-            for _ in descent.polish(_STEPS, 1e-4):
+            for _ in descent.polish(max_steps=8, tol=1e-4):
                 pass
     X = descent.X
     near = np.flatnonzero((np.abs(X - before) < _RETURN_DISTANCE).all(axis=1))

@@ -25,7 +25,7 @@ import numpy as np
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.solver.field.tensor import TensorField
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, names_of, sum_at
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, reject, sum_at
 
 # The same minimum angle as in `mesh.reference` (§F.1).
 _MIN_ANGLE = np.pi / 6
@@ -152,13 +152,9 @@ class RestStrain(Strain):
         with np.errstate(all="ignore"):
             self.m: FloatArray = 0.5 * z1 * z2.imag
             self.half: ComplexArray = 0.25j * self.sides[(1, 2, 0), :] / self.m
-        lost = np.flatnonzero(~(np.isfinite(self.m) & np.isfinite(self.half).all(axis=0)))
-        if lost.size:
-            raise ValueError(
-                f"the areas of {names_of('triangle', 'triangles', lost)} at rest are outside the "
-                f"range of doubles: scale the "
-                "surface to about unit size"
-            )
+        lost = ~(np.isfinite(self.m) & np.isfinite(self.half).all(axis=0))
+        remedy = "scale the surface to about unit size"
+        reject(lost, "triangle", "triangles", f"the areas of {{}} at rest are outside the range of doubles: {remedy}")
         # Unit vectors in the triangle's plane, (d, f): along the first side, and perpendicular to it.
         coordinates = np.ascontiguousarray(V.T)
         start, one, two = (coordinates[:, at] for at in self._corners)

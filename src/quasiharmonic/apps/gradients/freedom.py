@@ -116,7 +116,9 @@ class SlidingFreedom(Freedom):
         kink = self._track.at_kink(s)
         ahead, curvature = self._track.frame(s, np.ones(s.size, dtype=bool))
         back, curvature_back = self._track.frame(s, ~kink)
-        self._by_arc = self._barrier_gradient(s)
+        # The barrier's derivatives by the arc lengths of the sliding vertices, in units.
+        self._by_arc = np.zeros(s.size)
+        self._add_at_ends(self._by_arc, self._by_edges(s))
         slope, slope_back = (_component_along(tangent, at) + self._by_arc for tangent in (ahead, back))
         turned = kink & (slope_back > np.maximum(-slope, 0))
         rests: BoolArray = kink & (slope >= 0) & (slope_back <= 0)
@@ -156,12 +158,6 @@ class SlidingFreedom(Freedom):
     def _by_edges(self, s: FloatArray) -> FloatArray:
         """The barrier's derivatives by the arc lengths at each edge's ends, in units; (e, 2)."""
         return self._weight * self._unit * self._deviation.derivatives(s)[0]
-
-    def _barrier_gradient(self, s: FloatArray) -> FloatArray:
-        """The barrier's derivatives by the arc lengths of the sliding vertices, in units; (l,)."""
-        out = np.zeros(s.size)
-        self._add_at_ends(out, self._by_edges(s))
-        return out
 
     def _add_at_ends(self, out: FloatArray, by_ends: FloatArray) -> None:
         """Add values at the ends of the edges (e, 2) to those of the sliding vertices (l,)."""

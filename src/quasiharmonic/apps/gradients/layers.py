@@ -10,16 +10,19 @@ import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import repeat
-from typing import Any, TypedDict, cast
+from typing import Any, Generic, TypedDict, TypeVar, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.apps.flattening.free_boundary import flatten_surface
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.gradients.flatten_gradient import FlattenDerivativeKeywords, differentiate_flattened
-from quasiharmonic.apps.gradients.polish_gradient import differentiate_polish
-from quasiharmonic.apps.gradients.tensors import quasi_harmonic_derivative
+from quasiharmonic.apps.gradients.map_derivatives import (
+    FlattenDerivativeKeywords,
+    differentiate_flattened,
+    differentiate_polish,
+    quasi_harmonic_derivative,
+)
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.polishing import polish_options
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
@@ -29,10 +32,12 @@ from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import solve_problem
 from quasiharmonic.solver.search.many import ManyKeywords, injective_maps
 from quasiharmonic.util.arrays import FloatArray, index_array, real_array
-from quasiharmonic.util.options import FlattenOptions, MapOptions, Options, option
+from quasiharmonic.util.options import FlattenOptions, MapOptions, Options, option, takes
 
 #: An argument, converted to NumPy.
 Array = NDArray[Any]
+#: Tensors or arrays of a package.
+T = TypeVar("T")
 
 
 class MapNotFound(ValueError):  # noqa: N818  what it says is what happened
@@ -102,9 +107,8 @@ class Layer:
         own = {}
         for name, array in arrays.items():
             lead = array.shape[: array.ndim - len(self.shapes[name])]
-            own[name] = array[
-                tuple(0 if size == 1 else i for i, size in zip(item[len(item) - len(lead) :], lead, strict=True))
-            ]
+            last = item[len(item) - len(lead) :]
+            own[name] = array[tuple(0 if size == 1 else i for i, size in zip(last, lead, strict=True))]
         return own
 
 
@@ -206,8 +210,7 @@ def compute_gradients(
     """Return the gradients of a function of the maps (…, n, 2), by name, each with all batch axes; warn of doubts."""
     lead = cotangent.shape[:-2]
     out: dict[str, Array] = {
-        name: np.empty((*lead, *layer.shapes[name]), dtype=np.complex128 if name == "mu" else np.float64)
-        for name in wanted
+        name: np.empty((*lead, *layer.shapes[name]), dtype=argument_types(name)[0]) for name in wanted
     }
     for item, derivative in zip(np.ndindex(lead), derivatives, strict=True):
         _warn(derivative, item)
@@ -235,21 +238,33 @@ def sum_to_shape(gradient: Any, shape: tuple[int, ...]) -> Any:
     return gradient.sum(axis=short, keepdims=True) if short else gradient
 
 
+def argument_types(name: str) -> tuple[str, str]:
+    """Return the types of an argument: that of the computation, in double precision, and that in single precision."""
+    return ("complex128", "complex64") if name == "mu" else ("float64", "float32")
+
+
 def select_arguments(
-    layer: Layer, arguments: Mapping[str, Any], check: Callable[[str, Any], None]
-) -> tuple[tuple[str, ...], list[Any]]:
+    layer: Layer, arguments: Mapping[str, Any], check: Callable[[str, Any], None], conversion: str, prefix: str = ""
+) -> tuple[tuple[str, ...], list[Any], bool]:
     """Return the names and values of a layer's arguments without those that are None, with checked types and shapes.
 
-    ``check`` raises an error for the name and a wrong value. ValueError if an argument has neither one problem's shape
-    nor that with batch axes in front.
+    Also return whether all of them are in single precision. ``check`` raises an error for a value of another class or
+    device. TypeError for another type, with the call ``conversion``; ``prefix`` is that of the names of types.
+    ValueError if an argument has neither one problem's shape nor that with batch axes in front.
     """
     given = {name: array for name, array in arguments.items() if array is not None}
+    single = bool(given)
     for name, array in given.items():
         check(name, array)
+        double, short = (prefix + kind for kind in argument_types(name))
+        if str(array.dtype) not in (double, short):
+            wanted = f"{double} or {short}, not {array.dtype}: {name}.{conversion.format(double)}"
+            raise TypeError(f"{name} must be of {wanted}")
+        single &= str(array.dtype) == short
         shape, one = tuple(array.shape), layer.shapes[name]
         if len(shape) < len(one) or shape[len(shape) - len(one) :] != one:
             raise ValueError(f"{name} must have shape {one}, or batch axes before it, not {shape}")
-    return tuple(given), list(given.values())
+    return tuple(given), list(given.values()), single
 
 
 def _check_found(result: MapResult) -> FloatArray:
@@ -273,3 +288,113 @@ def _to_comparable(value: Any) -> Hashable:
     if isinstance(value, np.ndarray):
         return value.shape, value.tobytes()
     return value if isinstance(value, str | bool | int | float | None) else id(value)
+
+
+class LayerFunctions(Generic[T]):
+    """Maps as functions of the tensors of a package.
+
+    ``apply(make, settings, arguments)`` returns the maps of the layer ``make(*settings)`` for its arguments.
+    """
+
+    def __init__(self, apply: Callable[[Callable[..., Layer], tuple[Any, ...], Mapping[str, T | None]], T]) -> None:
+        self._apply = apply
+
+    def quasi_harmonic_map(
+        self,
+        problem: Problem,
+        mu: T | None = None,
+        *,
+        target: T | None = None,
+        rest: T | None = None,
+        reference: Reference = "equilateral",
+        linear_solver: str = "auto",
+    ) -> T:
+        """Return quasi-harmonic maps of tensors or arrays, as `quasiharmonic.quasi_harmonic_map`.
+
+        Parameters
+        ----------
+        problem : Problem
+            Triangles, fixed vertices, and the values of omitted arguments.
+        mu : (…, f) complex128 or complex64, optional
+            Beltrami coefficients; zero by default. Their gradient is ``∂/∂Re μ + i ∂/∂Im μ`` in PyTorch and
+            ``∂/∂Re μ − i ∂/∂Im μ`` in JAX, by their conventions.
+        target : (…, k, 2) float64 or float32, optional
+            Target positions of the fixed vertices.
+        rest : (…, n, 2) or (…, n, 3) float64 or float32, optional
+            Rest positions. They matter only with a ``reference`` other than ``"equilateral"``.
+        reference, linear_solver
+            As for `quasiharmonic.quasi_harmonic_map`.
+
+        Returns
+        -------
+        (…, n, 2) float64 or float32
+            In single precision if all arguments are. Injective only if the target is convex or μ is suitable.
+
+        Raises
+        ------
+        TypeError
+            If an argument is not a tensor or array, or has the wrong dtype.
+        ValueError
+            If an argument is on another device or has the wrong shape, or `quasiharmonic.quasi_harmonic_map` raises it.
+        """
+        settings = problem, reference, linear_solver
+        return self._apply(make_tensor_layer, settings, {"mu": mu, "target": target, "rest": rest})
+
+    @takes(SolvedOptions, SolvedKeywords)
+    def injective_map(
+        self, problem: Problem, *, target: T | None = None, rest: T | None = None, **options: Unpack[SolvedKeywords]
+    ) -> T:
+        """Return polished injective maps of tensors or arrays, as `quasiharmonic.solve`, converged to rounding.
+
+        Parameters
+        ----------
+        problem, target, rest
+            As for `quasi_harmonic_map`.
+        polish, slide, start, linear_solver
+            As for `quasiharmonic.solve`; ``start`` is shared by the whole batch. If the boundary slides along curves
+            that are not straight, gradients are typically accurate to 0.5 % (see `polish_derivative`).
+
+        Returns
+        -------
+        (…, n, 2) float64 or float32
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `quasi_harmonic_map`, or as `quasiharmonic.solve`.
+        MapNotFound
+            If no injective map was found for one item of the batch.
+        """
+        return self._apply(make_solved_layer, (problem, options), {"target": target, "rest": rest})
+
+    @takes(FlattenOptions, FlattenedKeywords)
+    def flatten(self, rest: T, F: ArrayLike, *, target: T | None = None, **options: Unpack[FlattenedKeywords]) -> T:
+        """Return maps with a free boundary, as `quasiharmonic.flatten`, converged to rounding.
+
+        Parameters
+        ----------
+        rest : (…, n, 2) or (…, n, 3) float64 or float32
+            Rest positions of one connected surface.
+        F : (f, 3) array of int
+            Triangles.
+        fixed : (k,) array of int, optional
+            Fixed vertices.
+        target : (…, k, 2) float64 or float32, optional
+            Target positions of the fixed vertices.
+        energy, weights, start, linear_solver
+            As for `quasiharmonic.flatten`; ``start`` is shared by the whole batch.
+
+        Returns
+        -------
+        (…, n, 2) float64 or float32
+            Without ``fixed``, the gradient is that of the map nearest to this one, although `flatten` would lay it out
+            differently. Use functions that do not depend on the map's position and rotation.
+
+        Raises
+        ------
+        TypeError, ValueError
+            As `quasi_harmonic_map`, or as `quasiharmonic.flatten`.
+        MapNotFound
+            If no injective map was found for one item of the batch.
+        """
+        return self._apply(make_flattened_layer, (rest, F, target, options), {"rest": rest, "target": target})

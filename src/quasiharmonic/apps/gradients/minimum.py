@@ -7,7 +7,6 @@ is not positive definite, only as much of the negative curvature of triangles is
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from threading import Lock
 from typing import Any
 
@@ -26,8 +25,6 @@ from quasiharmonic.util.progress import heartbeat
 
 # Maximum number of steps.
 _MAX_STEPS = 100
-# Maximum number of lengths of one step.
-_MAX_HALVINGS = 40
 # If the matrix is not positive definite, these fractions of the triangles' negative curvature are removed in turn.
 _CLAMPED = 1 / 64, 1 / 16, 1 / 4, 1.0
 # Steps with a strain of at most this on every triangle count as zero.
@@ -42,8 +39,6 @@ _REUSE_STRAIN = 1e-8
 _ROUNDING = 1e-13
 # With a unit diagonal, an eigenvalue below this counts as zero.
 _SINGULAR = 1e-10
-# Number of power iterations.
-_POWER_ITERATIONS = 2
 # A triangle whose ratio of smaller to larger singular value is below this counts as nearly collapsed.
 _COLLAPSED_RATIO = 1e-8
 
@@ -72,7 +67,10 @@ class Minimum:
         self.doubts: list[Doubt] = []
         with np.errstate(all="ignore"):
             left = self._converge(_MAX_STEPS if converge else 0)
-            self.forces = self._forces(self._deformation)
+            d, density = self._deformation, energy.energy
+            curvature = density.curvature(d, negative=1.0)
+            corners = np.ascontiguousarray(energy.F.T)
+            self.forces = Forces(corners, w.size, energy.g, energy.share, d.p, d.q, *density.gradient(d), curvature)
             self._check_numbers()
             if not self._exact:
                 self._factor_by_lu()
@@ -80,32 +78,33 @@ class Minimum:
 
     def solve(self, load: ComplexArray) -> ComplexArray:
         """Return the displacement (n,) of the vertices under a load (n,) on them."""
-        freedom = self._freedom
-        on_unknowns = freedom.gather(load)
+        return self._freedom.spread(self._solve_unknowns(self._freedom.gather(load)))
+
+    def _solve_unknowns(self, load: ComplexArray) -> ComplexArray:
+        """Return the change of the unknowns under a load on them."""
         if self._lu is None:
-            return freedom.spread(freedom.system.solve(on_unknowns))
+            return self._freedom.system.solve(load)
         with self._lock:
-            return freedom.spread(self._lu.solve(on_unknowns.view(np.float64)).view(np.complex128))
+            answer: ComplexArray = self._lu.solve(load.view(np.float64)).view(np.complex128)
+            return answer
 
     def _converge(self, steps: int) -> float:
         """Take steps until converged, leave the system factored, and return the strain of the step not taken."""
         last = np.inf
-        for left in range(steps, -1, -1):
+        while True:
             heartbeat()
-            gradient = self._evaluate()
-            step, self._exact = self._direction(gradient)
+            step, self._exact = self._direction(self._evaluate())
             size = self._strain(step)
             if size <= _ZERO_STRAIN or (self._exact and size <= _ROUNDING_STRAIN and size > 0.5 * last):
                 return size
-            if not left or not self._take_step(step):
+            if not steps or not self._take_step(step):
                 return size
             if self._exact and size <= _REUSE_STRAIN:
                 # Convergence is quadratic, so this was the last step, and the factor is accurate to the same number of
                 # digits.
                 self._evaluate()
                 return size
-            last = size
-        raise AssertionError("the last step has already returned")
+            last, steps = size, steps - 1
 
     def _evaluate(self) -> ComplexArray:
         """Evaluate the energy at the current map; return its gradient with respect to the unknowns."""
@@ -139,7 +138,7 @@ class Minimum:
         """Take the longest acceptable part of a step; return False if there is none."""
         before = self._energy.value_of(self._deformation) + self._freedom.extra()
 
-        def trial(t: float, bound: float) -> tuple[float, ComplexArray | None]:
+        def evaluate_step(t: float, bound: float) -> tuple[float, ComplexArray | None]:
             there = self._freedom.advance(self.w, t * step)
             if there is None:
                 return np.inf, None
@@ -148,19 +147,12 @@ class Minimum:
             return value, there if accepted else None
 
         # Near the stationary point only rounding changes the energy, so no decrease is required.
-        taken = backtrack(trial, before + _ROUNDING * abs(before), 0.0, tries=_MAX_HALVINGS)
+        taken = backtrack(evaluate_step, before + _ROUNDING * abs(before), 0.0, tries=40)
         if taken is None:
             return False
         self.w = taken.state
         self._freedom.keep()
         return True
-
-    def _forces(self, d: Deformation) -> Forces:
-        energy = self._energy
-        by_p, by_q = energy.energy.gradient(d)
-        form = energy.energy.curvature(d, negative=1.0)
-        corners = np.ascontiguousarray(energy.F.T)
-        return Forces(corners, self.w.size, energy.g, energy.share, d.p, d.q, by_p, by_q, form)
 
     def _check_numbers(self) -> None:
         """Raise a ValueError where the energy or a derivative of it is NaN or infinite."""
@@ -213,16 +205,12 @@ class Minimum:
         if not system.free.size:
             return 1.0
         scale = np.sqrt(np.abs(system.diagonal))
-        solve: Callable[[ComplexArray], ComplexArray] = system.solve
-        if self._lu is not None:
-            lu = self._lu
-            solve = lambda load: lu.solve(load.view(np.float64)).view(np.complex128)  # noqa: E731
         x = np.random.default_rng(0).standard_normal(scale.size)
         growth = 0.0
-        for _ in range(_POWER_ITERATIONS):
+        for _ in range(2):
             x *= scale / np.linalg.norm(x)
             try:
-                x = scale * solve(x.view(np.complex128)).view(np.float64)
+                x = scale * self._solve_unknowns(x.view(np.complex128)).view(np.float64)
             except NotPositiveDefinite:
                 return 0.0
             growth = float(np.linalg.norm(x))

@@ -107,16 +107,11 @@ def untangle_elements(F: IntArray, straight: FloatArray, searched: FloatArray, f
 
 def _untangle_near(F: IntArray, points: FloatArray, rings: int | None, fixed: IntArray) -> FloatArray:
     """Move nodes within some rings of inverted elements; None moves only their mid-side nodes."""
-    bad = inverted_elements(F, points)
-    movable = F[bad][:, MIDDLES] if rings is None else F[_grow(F, bad, rings)]
+    near = inverted_elements(F, points)
+    for _ in range(rings or 0):
+        near = np.flatnonzero(np.isin(F[:, :3], F[near, :3]).any(axis=1))
+    movable = F[near][:, MIDDLES] if rings is None else F[near]
     return _move_nodes(F, points, np.setdiff1d(movable, fixed))
-
-
-def _grow(F: IntArray, which: IntArray, rings: int) -> IntArray:
-    """Return the elements within some rings of others."""
-    for _ in range(rings):
-        which = np.flatnonzero(np.isin(F[:, :3], F[which, :3]).any(axis=1))
-    return which
 
 
 def _move_nodes(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:

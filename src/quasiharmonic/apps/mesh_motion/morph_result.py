@@ -14,7 +14,7 @@ from quasiharmonic.geometry.mesh.elements import corner_triangles, jacobian_coef
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.outcome import OutcomeOf, SummarisedOutcome
+from quasiharmonic.util.outcome import OutcomeOf, SummarisedOutcome, as_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -117,11 +117,7 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         """Return the result for JSON."""
         return {
             **self.result.to_dict(),
-            "success": self.success,
-            "message": self.message,
-            "valid": self.valid,
-            "inverted": self.inverted.tolist(),
-            "forbidden": self.forbidden.tolist(),
+            **as_plain(self, "success", "message", "valid", "inverted", "forbidden"),
             **summarise_qualities(self.quality_before, self.quality_after),
         }
 

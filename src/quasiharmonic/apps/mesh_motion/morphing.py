@@ -46,14 +46,7 @@ from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
-from quasiharmonic.util.arrays import (
-    FloatArray,
-    IntArray,
-    check_finite,
-    map_array,
-    names_of,
-    vertex_indices,
-)
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, map_array, reject, vertex_indices
 from quasiharmonic.util.options import MorphOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
@@ -324,8 +317,7 @@ def _find_fixed(
     positions = map_array("target", target, len(given), finite=False)
     check_finite("target", "row", "rows", positions)
     idle = given[~np.isin(given, F)]
-    if idle.size:
-        raise ValueError(f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, but no triangle uses them")
+    reject(idle, "vertex", "vertices", "moved_vertices refers to {}, but no triangle uses them")
     left = np.setdiff1d(boundary_edges(covering_triangles(F)[0], len(points)), given)
     there = points.copy()
     there[given] = positions

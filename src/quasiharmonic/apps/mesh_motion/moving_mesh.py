@@ -46,7 +46,7 @@ from quasiharmonic.util.arrays import (
     check_finite,
     check_integer,
     map_array,
-    names_of,
+    reject,
     sum_at,
     triangle_array,
     vertex_indices,
@@ -59,8 +59,6 @@ _FRACTION = 0.8
 _MIN_STEP = 1e-4
 # Minimum decrease, relative to the energy, that a step must predict.
 _TOLERANCE = 1e-4
-# Maximum number of steps that move the boundary.
-_MAX_STEPS = 25
 
 
 class MovingDescent:
@@ -112,7 +110,7 @@ class MovingDescent:
             return 0.0
         displacement[system.free] = found[0]
 
-        def trial(t: float, bound: float) -> tuple[float, Coordinates | None]:
+        def evaluate_step(t: float, bound: float) -> tuple[float, Coordinates | None]:
             w = start.w + t * displacement
             there = out_of_units(w[coordinates.fixed], coordinates.exponent)
             moved = coordinates.with_pinned(target if t == 1 else there)
@@ -122,7 +120,7 @@ class MovingDescent:
         if not longest >= _MIN_STEP:
             return 0.0
         tries = 1 + int(np.log2(longest / _MIN_STEP))
-        taken = backtrack(trial, 0.0, 0.0, longest=longest, tries=tries)
+        taken = backtrack(evaluate_step, 0.0, 0.0, longest=longest, tries=tries)
         if taken is None:
             return 0.0
         model.coordinates = taken.state
@@ -226,9 +224,7 @@ class MovingMesh:
         self._points = map_array("points", points)
         F = triangle_array(F, len(self._points))
         ratio = mean_ratio(self._points, F)
-        flat = np.flatnonzero(ratio == 0)
-        if flat.size:
-            raise ValueError(f"{names_of('triangle', 'triangles', flat)} degenerate: repair the mesh first")
+        reject(ratio == 0, "triangle", "triangles", "{} degenerate: repair the mesh first")
         F[ratio < 0] = F[ratio < 0][:, [0, 2, 1]]
         check_spread(F, len(self._points))
         self._moved = vertex_indices("moved_vertices", moved_vertices, len(self._points))
@@ -254,16 +250,12 @@ class MovingMesh:
     @property
     def points(self) -> FloatArray:
         """A copy of the current mesh; every triangle or tetrahedron is strictly positive, verified exactly."""
-        if self._volume is not None:
-            return self._volume.points.copy()
-        return self._points.copy()
+        return (self._points if self._volume is None else self._volume.points).copy()
 
     @property
     def F(self) -> IntArray:
         """The triangles (f, 3), counterclockwise, or tetrahedra (f, 4), positive."""
-        if self._volume is not None:
-            return self._volume.T
-        return self._domain.F
+        return self._domain.F if self._volume is None else self._volume.T
 
     def advance(self, target: ArrayLike) -> FloatArray:
         """Move the boundary, and the mesh with it.
@@ -293,7 +285,7 @@ class MovingMesh:
         try:
             # Overflow gives inf or NaN, and a step with either is never accepted.
             with np.errstate(all="ignore"):
-                share = self._descent.move(goal, _TOLERANCE, _MAX_STEPS)
+                share = self._descent.move(goal, _TOLERANCE, steps=25)
             if share < 1:
                 raise RuntimeError(
                     f"the boundary can be moved only {share:.1%} of the way: then triangles become too small for such "

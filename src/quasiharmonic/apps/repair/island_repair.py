@@ -84,26 +84,26 @@ class IslandRepair:
         tried: set[bytes] = set()
         whole = self._options.whole
         for rings in () if whole else _RINGS:
-            free = self._around(self._repairable(), rings)
+            free = self._find_near(self._find_repairable(), rings)
             if not 0 < np.count_nonzero(free) <= _MAX_SHARE * np.count_nonzero(~self._fixed):
                 break
             for patch in self._components(free):
                 if patch.tobytes() not in tried:
                     tried.add(patch.tobytes())
                     self._attempt(patch, _PATCH_ITERATIONS, keep=True)
-        if self._repairable().size:
+        if self._find_repairable().size:
             for part in self._components(~self._fixed):
                 if inverted_triangles(self._F[part[self._F].any(axis=1)], self.uv).size:
                     self._attempt(part, self._options.max_iterations, keep=not whole)
         if self.inverted.size:
             self._explain()
 
-    def _repairable(self) -> IntArray:
+    def _find_repairable(self) -> IntArray:
         """Inverted triangles that have a free vertex."""
         left = self.inverted
         return left[~self._fixed[self._F[left]].all(axis=1)]
 
-    def _around(self, triangles: IntArray, rings: int) -> BoolArray:
+    def _find_near(self, triangles: IntArray, rings: int) -> BoolArray:
         """Interior vertices within a number of rings of triangles; the triangles' own vertices are the first ring."""
         near: BoolArray = mark(len(self.uv), self._F[triangles])
         for _ in range(rings - 1):

@@ -22,15 +22,9 @@ from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import Status, Step
-from quasiharmonic.util.arrays import (
-    FloatArray,
-    IntArray,
-    count_of,
-    names_of,
-    vertex_indices,
-)
+from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, names_of, vertex_indices
 from quasiharmonic.util.options import RepairOptions, takes
-from quasiharmonic.util.outcome import SummarisedOutcome
+from quasiharmonic.util.outcome import SummarisedOutcome, as_plain
 from quasiharmonic.util.progress import reports_progress
 
 
@@ -90,16 +84,8 @@ class RepairedIsland(IslandReport):
 
     def to_dict(self) -> dict[str, Any]:
         """The report for JSON, with the first triangle and the number of triangles."""
-        return {
-            **super().to_dict(),
-            "injective": self.injective,
-            "bijective": self.bijective,
-            "inverted_before": self.inverted_before.tolist(),
-            "inverted": self.inverted.tolist(),
-            "moved_vertices": self.moved_vertices.tolist(),
-            "reason": self.reason,
-            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
-        }
+        verdict = "injective", "bijective", "inverted_before", "inverted"
+        return super().to_dict() | as_plain(self, *verdict, "moved_vertices", "reason", "diagnosis")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

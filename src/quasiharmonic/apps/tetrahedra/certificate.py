@@ -31,8 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED, find_contacts, outer_winding
-from quasiharmonic.apps.tetrahedra.signs import ExactSigns
-from quasiharmonic.apps.tetrahedra.topology import FaceReport, find_patches, inspect_faces
+from quasiharmonic.apps.tetrahedra.elements import ExactSigns, FaceReport, find_patches, inspect_faces
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -46,7 +45,7 @@ from quasiharmonic.util.arrays import (
     names_of,
     real_array,
 )
-from quasiharmonic.util.outcome import Verdict
+from quasiharmonic.util.outcome import Verdict, as_plain
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -160,15 +159,10 @@ class TetrahedraCertificate(ReadOnly, Verdict):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the certificate in plain Python types, fit for JSON; boundary triangles by their vertices."""
+        elements = "inverted", "degenerate", "nonfinite", "repeated", "nonmanifold", "inconsistent"
         return {
             **super().to_dict(),
-            "injective": self.injective,
-            "positive": self.positive,
-            "tetrahedra": self.tetrahedra,
-            **{
-                name: getattr(self, name).tolist()
-                for name in ("inverted", "degenerate", "nonfinite", "repeated", "nonmanifold", "inconsistent")
-            },
+            **as_plain(self, "injective", "positive", "tetrahedra", *elements),
             "boundary_triangles": len(self.boundary),
             "crossings": self.boundary[self.crossings].tolist(),
             "multiply_covered": self.boundary[self.multiply_covered].tolist(),
@@ -223,8 +217,7 @@ def certify_arrays(
     """`certify_tetrahedra` of checked arrays; ``faces`` is the result of `inspect_faces`, if known."""
     signs = ExactSigns(X)
     sign = signs(T)
-    finite = np.asarray(signs.finite[T].all(axis=1)) if len(T) else np.ones(0, dtype=np.bool_)
-    sign[~finite] = 0
+    finite = np.asarray(signs.finite[T].all(axis=1))
     if faces is None:
         faces = inspect_faces(T, len(X))
     clean = len(T) > 0 and not (faces.repeated.size or len(faces.nonmanifold) or len(faces.inconsistent))

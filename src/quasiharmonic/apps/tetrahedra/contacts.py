@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.tetrahedra.signs import ExactSigns, SignArray
+from quasiharmonic.apps.tetrahedra.elements import ExactSigns, SignArray
 from quasiharmonic.geometry.exact.predicates import box_pairs, box_pairs_between, orientation
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, morton_order
 from quasiharmonic.util.progress import heartbeat
@@ -47,7 +47,7 @@ def find_contacts(F: IntArray, X: FloatArray, signs: ExactSigns) -> IntArray:
     for i, j in box_pairs(lo[order], hi[order]):
         heartbeat()
         one, other = order[i], order[j]
-        meet = _meet(F[one], F[other], X, signs)
+        meet = _triangles_meet(F[one], F[other], X, signs)
         found.append(np.sort(np.stack([one[meet], other[meet]], axis=1), axis=1))
         count += int(np.count_nonzero(meet))
         if count >= MAX_LISTED:
@@ -94,7 +94,7 @@ def _starts_inside(edge: IntArray, F: IntArray, second: BoolArray, X: FloatArray
     return np.asarray((one >= 0) & (other >= 0))
 
 
-def _meet(F: IntArray, G: IntArray, X: FloatArray, signs: ExactSigns) -> BoolArray:
+def _triangles_meet(F: IntArray, G: IntArray, X: FloatArray, signs: ExactSigns) -> BoolArray:
     """Whether pairs of triangles (k, 3) meet outside their common vertices and edges."""
     same = F[:, :, None] == G[:, None, :]
     shared = same.sum(axis=(1, 2))
@@ -103,7 +103,7 @@ def _meet(F: IntArray, G: IntArray, X: FloatArray, signs: ExactSigns) -> BoolArr
         some = np.flatnonzero(shared == count)
         if some.size:
             one, other = _align(F[some], G[some], same[some], count)
-            meet[some] = _meet_aligned(one, other, count, X, signs)
+            meet[some] = _aligned_triangles_meet(one, other, count, X, signs)
     return meet
 
 
@@ -119,8 +119,8 @@ def _align(F: IntArray, G: IntArray, same: BoolArray, count: int) -> tuple[IntAr
     return F, np.take_along_axis(G, np.concatenate([place, rest], axis=1), axis=1)
 
 
-def _meet_aligned(F: IntArray, G: IntArray, count: int, X: FloatArray, signs: ExactSigns) -> BoolArray:
-    """`_meet` for triangles whose first ``count`` vertices are the same."""
+def _aligned_triangles_meet(F: IntArray, G: IntArray, count: int, X: FloatArray, signs: ExactSigns) -> BoolArray:
+    """`_triangles_meet` for triangles whose first ``count`` vertices are the same."""
     meet = np.zeros(len(F), dtype=np.bool_)
     # Signs of the other vertices of G relative to the plane of F. If all are on one side, the triangles do not meet.
     of_g = _plane_signs(F, G[:, count:], signs)
@@ -128,7 +128,7 @@ def _meet_aligned(F: IntArray, G: IntArray, count: int, X: FloatArray, signs: Ex
     F, G, of_g = F[some], G[some], of_g[some]
     flat = np.all(of_g == 0, axis=1)
     if flat.any():
-        meet[some[flat]] = _meet_in_plane(F[flat], G[flat], count, X)
+        meet[some[flat]] = _coplanar_triangles_meet(F[flat], G[flat], count, X)
     if count == 2 or flat.all():
         return meet
     some, F, G, of_g = some[~flat], F[~flat], G[~flat], of_g[~flat]
@@ -161,12 +161,7 @@ def _edge_meets(
         meet[flat] = ~_apart_in_plane(edge[flat], F[flat], X)
     through = np.flatnonzero((p_side * q_side <= 0) & ~flat)
     if through.size:
-        turns = np.stack(
-            [
-                signs(np.concatenate([edge[through], F[through][:, side]], axis=1))
-                for side in (list(side) for side in _SIDES)
-            ]
-        )
+        turns = np.stack([signs(np.concatenate([edge[through], F[through][:, side]], axis=1)) for side in _SIDES])
         meet[through] = np.all(turns >= 0, axis=0) | np.all(turns <= 0, axis=0)
     return meet
 
@@ -190,8 +185,8 @@ def _flatten(points: IntArray, axes: IntArray, X: FloatArray) -> FloatArray:
     return np.take_along_axis(X[points], axes[:, None, :], axis=2)
 
 
-def _meet_in_plane(F: IntArray, G: IntArray, count: int, X: FloatArray) -> BoolArray:
-    """`_meet_aligned` for triangles in common planes."""
+def _coplanar_triangles_meet(F: IntArray, G: IntArray, count: int, X: FloatArray) -> BoolArray:
+    """`_aligned_triangles_meet` for triangles in common planes."""
     axes, turn = _project(F, X)
     f, g = _flatten(F, axes, X), _flatten(G, axes, X)
     other_turn = orientation(g[:, 0], g[:, 1], g[:, 2])
@@ -269,14 +264,14 @@ class _Line(NamedTuple):
 
 def _first_line(boxes: _Boxes, triangles: IntArray) -> list[tuple[int, int]]:
     """Return the crossings of a line through one of some triangles: the triangle, and the winding number outside."""
-    for line in _choices(triangles):
-        found = _crossings(boxes, line)
+    for line in _list_lines(triangles):
+        found = _find_line_crossings(boxes, line)
         if found is not None:
             return found
     raise AssertionError("every line through the surface meets an edge")
 
 
-def _choices(triangles: IntArray) -> Iterator[_Line]:
+def _list_lines(triangles: IntArray) -> Iterator[_Line]:
     for weights in _WEIGHTS:
         for triangle in triangles[:: max(len(triangles) // 20, 1)].tolist():
             for axes in _AXES:
@@ -285,7 +280,7 @@ def _choices(triangles: IntArray) -> Iterator[_Line]:
         yield _Line(int(triangles[k % len(triangles)]), (k * k + 1, 7 * k + 3, 5 * k + 2), _AXES[k % 3])
 
 
-def _crossings(boxes: _Boxes, line: _Line) -> list[tuple[int, int]] | None:
+def _find_line_crossings(boxes: _Boxes, line: _Line) -> list[tuple[int, int]] | None:
     """Crossings of a line; None if it meets an edge of a triangle."""
     (corners, lo, hi), (triangle, weights, axes) = boxes, line
     total = sum(weights)

@@ -1,4 +1,8 @@
-"""Place the free vertices of a tetrahedral mesh whose other vertices are fixed."""
+"""Place the free vertices of a tetrahedral mesh: the others are fixed, or slide along flat parts of the boundary.
+
+A sliding vertex keeps the boundary in shape if it moves only along directions that lie in the planes of all boundary
+triangles around it: two directions on a plane, one on an edge between planes, none at a corner or on a curved surface.
+"""
 
 from __future__ import annotations
 
@@ -10,26 +14,140 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.tetrahedra.certificate import certify_arrays, find_boundary_contacts, tetrahedron_array
 from quasiharmonic.apps.tetrahedra.contacts import MAX_LISTED
-from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
-from quasiharmonic.apps.tetrahedra.energy import ShapeEnergy
-from quasiharmonic.apps.tetrahedra.obstructions import find_obstructions
+from quasiharmonic.apps.tetrahedra.descent import ShapeEnergy, TetrahedraDescent, project
+from quasiharmonic.apps.tetrahedra.elements import FaceReport, inspect_faces, tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.result import (
     TetrahedraObstruction,
     TetrahedraResult,
     TetrahedraStatus,
+    find_obstructions,
     tetrahedron_quality,
 )
-from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
-from quasiharmonic.apps.tetrahedra.sliding import NO_SLIDING, Sliding, project
-from quasiharmonic.apps.tetrahedra.topology import FaceReport, inspect_faces
 from quasiharmonic.problem.run import Run
-from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, mark, names_of
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    check_finite,
+    find_exponent,
+    invert_indices,
+    mark,
+    names_of,
+    real_array,
+    reject,
+)
 from quasiharmonic.util.options import TetrahedraOptions
 
+# Largest distance of a vertex from a plane, relative to the extent of the mesh.
+_TOLERANCE = 1e-6
+# Least cosine between a triangle on a named plane and this plane.
+_PARALLEL = 0.9
 # Maximum number of crossing pairs of boundary triangles that are listed.
 _MAX_LISTED = 20
 # Newton steps without progress after which untangling has stalled.
 _PATIENCE = 100
+
+
+@dataclass(frozen=True)
+class Sliding:
+    """Vertices that slide (k,), ascending, and the projections (k, 3, 3) to their directions."""
+
+    vertices: IntArray
+    projections: FloatArray
+
+    def restrict(self, free: IntArray) -> FloatArray | None:
+        """Return the projections (m, 3, 3) of free vertices (m,), ascending; None if no vertex slides."""
+        if not self.vertices.size:
+            return None
+        P = np.broadcast_to(np.eye(3), (free.size, 3, 3)).copy()
+        P[np.searchsorted(free, self.vertices)] = self.projections
+        return P
+
+
+#: No vertex slides.
+NO_SLIDING = Sliding(np.empty(0, dtype=np.int64), np.empty((0, 3, 3)))
+
+
+def find_sliding(F: IntArray, X: FloatArray, moved: IntArray, slide: bool | ArrayLike) -> Sliding:
+    """Return the vertices of boundary triangles F (f, 3) that can slide, without those that are ``moved``.
+
+    ``slide`` is True for all flat parts of the boundary, or the planes (m, 4) of those parts: ``(a, b, c, d)`` has the
+    points with ``a x + b y + c z = d``. A vertex between a named and another part is fixed. A part counts as flat if
+    rounding to single precision, or a millionth of the extent, explains its distance from a plane.
+    ValueError if a plane has no direction or contains no boundary triangle.
+    """
+    everywhere = isinstance(slide, bool | np.bool_)
+    if everywhere and not slide:
+        return NO_SLIDING
+    used = np.unique(F)
+    centre = X[used].mean(axis=0)
+    extent = np.abs(X[used] - centre).max()
+    P = (X - centre) / extent
+    a, b, c = P[F].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    longest = np.sqrt(np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0))
+    area = np.linalg.norm(normals, axis=1)
+    # Triangles without area restrict nothing.
+    normals = np.divide(normals, area[:, None], out=np.zeros_like(normals), where=area[:, None] > 0)
+    height = np.divide(area, longest, out=np.zeros_like(area), where=longest > 0)
+    rounding = _resolution(X[used]) / extent
+    if not everywhere:
+        normals, named = _snap_to_planes(slide, F, P, normals, (centre, extent, rounding))
+        used = np.setdiff1d(used, F[~named])
+    vertices = np.setdiff1d(used, moved)
+    number = invert_indices(len(X), vertices)
+    # A unit step along a direction leaves the plane of a triangle by at most this, relative to its height.
+    leaning = normals * height[:, None]
+    squares = np.zeros((vertices.size, 3, 3))
+    for corner in number[F].T:
+        inside = corner >= 0
+        np.add.at(squares, corner[inside], leaning[inside, :, None] * leaning[inside, None, :])
+    values, directions = np.linalg.eigh(squares)
+    # Directions across which no triangle leans.
+    directions *= (values < (_TOLERANCE + rounding) ** 2)[:, None, :]
+    free = directions.any(axis=(1, 2)) & (values[:, -1] > 0)
+    directions = directions[free]
+    return Sliding(vertices[free], directions @ directions.transpose(0, 2, 1))
+
+
+def _resolution(X: FloatArray) -> float:
+    """The distance by which coordinates may be rounded: that of single precision if all of them have it."""
+    with np.errstate(over="ignore", under="ignore"):
+        single = bool((X.astype(np.float32) == X).all())
+    return 4 * float(np.abs(X).max()) * float(np.finfo(np.float32 if single else np.float64).eps)
+
+
+def _snap_to_planes(
+    slide: ArrayLike, F: IntArray, P: FloatArray, normals: FloatArray, frame: tuple[FloatArray, float, float]
+) -> tuple[FloatArray, BoolArray]:
+    """Return the normals with those of planes where triangles lie on one, and which triangles do.
+
+    ``P`` (n, 3) are positions relative to the centre and the extent of the mesh; ``frame`` has both, and the rounding.
+    """
+    planes = real_array("slide", slide)
+    if planes.ndim != 2 or planes.shape[1] != 4:
+        raise ValueError(f"slide must be a bool or planes of shape (m, 4), not of shape {planes.shape}")
+    check_finite("slide", "plane", "planes", planes)
+    centre, extent, rounding = frame
+    named = np.zeros(len(F), dtype=np.bool_)
+    normals = normals.copy()
+    for k, plane in enumerate(planes):
+        size = np.abs(plane[:3]).max()
+        if not size > 0:
+            raise ValueError(f"slide has no direction in plane {k}: {plane.tolist()}")
+        length = np.linalg.norm(plane[:3] / size)
+        normal = plane[:3] / size / length
+        height = P @ normal
+        distance = height - (plane[3] / size / length - centre @ normal) / extent
+        # Of a thin body only one side lies on the plane.
+        near = np.abs(distance) <= _TOLERANCE * np.ptp(height[F]) + rounding
+        parallel = (np.abs(normals @ normal) > _PARALLEL) | ~normals.any(axis=1)
+        on = near[F].all(axis=1) & parallel
+        if not on.any():
+            raise ValueError(f"slide has plane {k}, {plane.tolist()}, but no boundary triangle lies on it")
+        normals[on] = normal
+        named |= on
+    return normals, named
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +174,8 @@ def check_rest(T: ArrayLike, X: FloatArray) -> RestMesh:
     if not len(T):
         raise ValueError("the mesh has no tetrahedra")
     sign, nonfinite = tetrahedron_signs(T, X)
-    if nonfinite.size:
-        raise ValueError(f"points are not finite at {names_of('tetrahedron', 'tetrahedra', nonfinite)}")
-    flat = np.flatnonzero(sign == 0)
-    if flat.size:
-        raise ValueError(f"{names_of('tetrahedron', 'tetrahedra', flat)} degenerate at rest: repair the mesh first")
+    reject(nonfinite, "tetrahedron", "tetrahedra", "points are not finite at {}")
+    reject(sign == 0, "tetrahedron", "tetrahedra", "{} degenerate at rest: repair the mesh first")
     T = np.where((sign < 0)[:, None], T[:, [1, 0, 2, 3]], T)
     faces = inspect_faces(T, len(X))
     for found, what in (
@@ -176,11 +291,8 @@ def make_energy(mesh: RestMesh, begin: FloatArray, whole: bool) -> tuple[ShapeEn
             ratio = new / old if old > 0 else 0.0
         scale = float(np.cbrt(ratio)) if 0 < ratio < np.inf else 2.0 ** (exponents[0] - exponents[1])
         energy = ShapeEnergy(mesh.T, rest * scale)
-    bad = np.flatnonzero(~np.isfinite(energy.gradients).all(axis=(0, 1)))
-    if bad.size:
-        raise ValueError(
-            f"{names_of('tetrahedron', 'tetrahedra', bad)} too thin or too small at rest for double precision"
-        )
+    bad = np.asarray(~np.isfinite(energy.gradients).all(axis=(0, 1)))
+    reject(bad, "tetrahedron", "tetrahedra", "{} too thin or too small at rest for double precision")
     return energy, X, exponents[1]
 
 
@@ -236,7 +348,7 @@ def _search(descent: TetrahedraDescent, options: TetrahedraOptions) -> tuple[Flo
     best = [(len(energy.T) + 1, X)]
     run = Run(options.callback)
     with run.until_interrupted(), np.errstate(all="ignore"):
-        count = int(np.count_nonzero(~(energy.determinants(X) > 0)))
+        count = energy.count_inverted(X)
         best[:] = [(count, X)]
         run.record(count, np.inf)
         if count and descent.free.size:
@@ -257,7 +369,7 @@ def _untangle(
     energy = descent.energy
     since, least = 0, float(energy.determinants(descent.X).min())
     for now in descent.untangle(options.max_iterations):
-        count = int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
+        count = energy.count_inverted(descent.X)
         since += 1
         if count < best[-1][0] or now > least + 0.05 * abs(least):
             since, least = 0, max(now, least)
@@ -266,7 +378,7 @@ def _untangle(
         run.record(count, np.inf)
         if since >= _PATIENCE:
             break
-    return int(np.count_nonzero(~(energy.determinants(descent.X) > 0)))
+    return energy.count_inverted(descent.X)
 
 
 def _polish(descent: TetrahedraDescent, options: TetrahedraOptions, run: Run) -> TetrahedraStatus:

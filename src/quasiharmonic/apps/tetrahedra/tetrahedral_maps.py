@@ -10,29 +10,21 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.tetrahedra.certificate import space_array
 from quasiharmonic.apps.tetrahedra.descent import TetrahedraDescent
+from quasiharmonic.apps.tetrahedra.elements import tetrahedron_signs
 from quasiharmonic.apps.tetrahedra.placement import (
     RestMesh,
+    Sliding,
     check_rest,
     extend_harmonically,
+    find_sliding,
     make_energy,
     place_vertices,
 )
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
-from quasiharmonic.apps.tetrahedra.signs import tetrahedron_signs
-from quasiharmonic.apps.tetrahedra.sliding import Sliding, find_sliding
 from quasiharmonic.problem.result import Step
-from quasiharmonic.util.arrays import (
-    FloatArray,
-    IntArray,
-    fixed_vertices,
-    names_of,
-    vertex_indices,
-)
+from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, reject, vertex_indices
 from quasiharmonic.util.options import MorphOptions, TetrahedraOptions, takes
 from quasiharmonic.util.progress import reports_progress
-
-# Maximum number of Newton steps to untangle the mesh after one move.
-_MAX_STEPS = 200
 
 
 class TetrahedraKeywords(TypedDict, total=False):
@@ -111,11 +103,7 @@ def is_volume(points: ArrayLike, cells: ArrayLike) -> bool:
 
 
 def morph_tetrahedra(
-    points: ArrayLike,
-    T: ArrayLike,
-    moved_vertices: ArrayLike,
-    target: ArrayLike,
-    options: MorphOptions,
+    points: ArrayLike, T: ArrayLike, moved_vertices: ArrayLike, target: ArrayLike, options: MorphOptions
 ) -> TetrahedraResult:
     """`quasiharmonic.morph` for points (n, 3) and tetrahedra (t, 4).
 
@@ -131,30 +119,23 @@ def morph_tetrahedra(
     points = space_array("points", points, finite=False)
     first = points if rest is None else space_array("rest", rest, len(points), finite=False)
     mesh = check_rest(T, first)
-    moved = find_moved(mesh, len(points), moved_vertices)
+    moved, still, sliding = find_fixed(mesh, points, moved_vertices, options.slide)
     goal = space_array("target", target, moved.size)
-    sliding = find_sliding(mesh.faces.boundary, points, moved, options.slide)
-    still = find_still(mesh, moved, sliding)
     begin = (None if rest is None else points) if start is None else space_array("start", start, len(points))
     fixed, goal = np.concatenate([moved, still]), np.concatenate([goal, points[still]])
     return place_vertices(mesh, points, fixed, goal, begin, checked, sliding)
 
 
-def find_moved(mesh: RestMesh, n: int, moved_vertices: ArrayLike) -> IntArray:
-    """Check the moved vertices of a mesh of ``n`` vertices."""
-    moved = vertex_indices("moved_vertices", moved_vertices, n)
-    times = np.bincount(moved, minlength=1)
-    if times.max() > 1:
-        raise ValueError(f"{names_of('vertex', 'vertices', np.flatnonzero(times > 1))} moved more than once")
+def find_fixed(
+    mesh: RestMesh, points: FloatArray, moved_vertices: ArrayLike, slide: bool | ArrayLike
+) -> tuple[IntArray, IntArray, Sliding]:
+    """Return the moved vertices, checked, the boundary vertices that neither move nor slide, and those that slide."""
+    moved = vertex_indices("moved_vertices", moved_vertices, len(points))
+    reject(np.bincount(moved) > 1, "vertex", "vertices", "{} moved more than once")
     idle = moved[~np.isin(moved, mesh.T)]
-    if idle.size:
-        raise ValueError(f"moved_vertices refers to {names_of('vertex', 'vertices', idle)}, in no tetrahedron")
-    return moved
-
-
-def find_still(mesh: RestMesh, moved: IntArray, sliding: Sliding) -> IntArray:
-    """Return the boundary vertices that neither move nor slide."""
-    return np.setdiff1d(mesh.boundary_vertices, np.concatenate([moved, sliding.vertices]))
+    reject(idle, "vertex", "vertices", "moved_vertices refers to {}, in no tetrahedron")
+    sliding = find_sliding(mesh.faces.boundary, points, moved, slide)
+    return moved, np.setdiff1d(mesh.boundary_vertices, np.concatenate([moved, sliding.vertices])), sliding
 
 
 class MovingTetrahedra:
@@ -171,9 +152,8 @@ class MovingTetrahedra:
         self.points = space_array("points", points)
         self._mesh = check_rest(T, self.points)
         self._settle = settle
-        self._moved = find_moved(self._mesh, len(self.points), moved_vertices)
-        sliding = find_sliding(self._mesh.faces.boundary, self.points, self._moved, slide)
-        self._fixed = np.concatenate([self._moved, find_still(self._mesh, self._moved, sliding)])
+        self._moved, still, sliding = find_fixed(self._mesh, self.points, moved_vertices, slide)
+        self._fixed = np.concatenate([self._moved, still])
         self._free = np.setdiff1d(np.unique(self._mesh.T), self._fixed)
         self._projections = sliding.restrict(self._free)
         self._energy, scaled, self._exponent = make_energy(self._mesh, self.points, False)
@@ -196,8 +176,8 @@ class MovingTetrahedra:
         with np.errstate(all="ignore"):
             descent.X = extend_harmonically(self._energy, before, self._fixed, places, self._projections)
             descent.X[self._fixed] = places
-            if descent.make_valid(_MAX_STEPS):
-                for _ in descent.polish(self._settle, 1e-8):
+            if descent.make_valid(max_steps=200):
+                for _ in descent.polish(self._settle, tol=1e-8):
                     pass
         points = self.points.copy()
         points[self._moved] = goal

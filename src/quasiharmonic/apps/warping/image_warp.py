@@ -202,10 +202,10 @@ def warp_along(
     inverse = InverseMap(rest, F, positions)
     source = _find_sources(inverse, height, width)
     channels = pixels.reshape(*pixels.shape[:2], -1)
-    layers = [
-        np.ascontiguousarray(channels[..., k], dtype=_find_drawable_type(pixels.dtype))
-        for k in range(channels.shape[2])
-    ]
+    # SciPy draws from these types without loss.
+    drawable = pixels.dtype.kind in "iu" or pixels.dtype in (np.float32, np.float64)
+    kind = pixels.dtype if drawable else np.float64
+    layers = [np.ascontiguousarray(channels[..., k], dtype=kind) for k in range(channels.shape[2])]
     drawn = np.zeros((height * width, len(layers)), dtype=pixels.dtype)
     for start in range(0, height * width, _PIXELS):
         here = source[start : start + _PIXELS]
@@ -266,8 +266,3 @@ def _fill(inverse: InverseMap, source: FloatArray) -> None:
         along, across = origins[t, 1:] - origins[t, 0]
         place = source[y0 : y1 + 1, x0 : x1 + 1]
         place[inside] = origins[t, 0] + second[inside][:, None] * along + third[inside][:, None] * across
-
-
-def _find_drawable_type(kind: np.dtype[Any]) -> np.dtype[Any]:
-    """Return a dtype that SciPy can draw from without loss."""
-    return kind if kind.kind in "iu" or kind in (np.float32, np.float64) else np.dtype(np.float64)

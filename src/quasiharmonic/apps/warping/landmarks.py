@@ -18,6 +18,7 @@ from quasiharmonic.util.arrays import (
     map_array,
     names_of,
     real_array,
+    reject,
 )
 
 # Minimum number of cells along the shorter side, so that vertices can move between landmarks and the border.
@@ -64,9 +65,8 @@ def make_landmarks(
     edge = is_on_border(before, size)
     if np.array_equal(before[edge], after[edge]):
         _check_inside("target", after, ((after > 0) & (after < size)).all(axis=1) | edge, size)
-    soft = np.flatnonzero(edge & ~np.isinf(weight))
-    if soft.size:
-        raise ValueError(f"weights: {names_of('landmark', 'landmarks', soft)} on the border, where landmarks are exact")
+    soft = edge & ~np.isinf(weight)
+    reject(soft, "landmark", "landmarks", "weights: {} on the border, where landmarks are exact")
     _check_apart("landmarks", before)
     _check_apart("target", after[np.isinf(weight)], np.flatnonzero(np.isinf(weight)))
     check_sequence("curves", curves, "pairs of polylines")
@@ -102,9 +102,7 @@ def _weights(weights: ArrayLike | None, k: int) -> FloatArray:
     array = np.full(k, np.inf) if weights is None else real_array("weights", weights)
     if array.shape != (k,):
         raise ValueError(f"weights must have shape ({k},), one for each landmark, not {array.shape}")
-    bad = np.flatnonzero(~(array > 0))
-    if bad.size:
-        raise ValueError(f"the weight is not positive at {names_of('landmark', 'landmarks', bad)}")
+    reject(~(array > 0), "landmark", "landmarks", "the weight is not positive at {}")
     return array
 
 

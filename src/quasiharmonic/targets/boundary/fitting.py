@@ -18,9 +18,6 @@ from quasiharmonic.targets.outlines.contours import corners as corners_of
 from quasiharmonic.targets.outlines.contours import filled, in_unit
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of
 
-# Distance between the outlines of several islands, relative to their width.
-_GAP = 0.05
-
 
 @dataclass(frozen=True, eq=False)
 class FittedProblem:
@@ -72,7 +69,8 @@ def fit_boundary(
     corner is not on the boundary.
     """
     if beside:
-        right = beside * (1 + _GAP) * float(np.ptp(np.concatenate(contours)[:, 0]))
+        # The outlines of several islands are 5 % of their width apart.
+        right = beside * (1 + 0.05) * float(np.ptp(np.concatenate(contours)[:, 0]))
         contours = [contour + np.array([right, 0.0]) for contour in contours]
     without_holes = filled(contours)
     holes = len(contours) - len(without_holes)

@@ -20,14 +20,13 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from inspect import cleandoc
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn
 
-from quasiharmonic.ui.cli.interrupts import Interrupts
+from quasiharmonic.ui.cli.process import NO_READER, Interrupts, output_failed, require_output, tell
 from quasiharmonic.ui.cli.report import ReportError, describe_error, in_options, use_options
-from quasiharmonic.ui.cli.streams import NO_READER, output_failed, tell
-from quasiharmonic.ui.cli.version import Version
 from quasiharmonic.util.spelling import suggest
 
 # The subcommands by group, in the order of the help. Each is a module of `commands`.
@@ -170,6 +169,47 @@ class CommandParser(argparse.ArgumentParser):
             file.write(self.format_help())
 
 
+class Version(argparse.Action):
+    """Print the text of `describe_environment` and exit."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **_: Any) -> None:
+        super().__init__(
+            option_strings, argparse.SUPPRESS, nargs=0, help="show the version and the environment, and exit"
+        )
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        require_output()
+        print(describe_environment())
+        parser.exit()
+
+
+def describe_environment() -> str:
+    """Return version, Python, system, packages, whether loops are compiled, and linear solvers; one line each."""
+    import os
+    import platform
+    from importlib.metadata import version
+
+    from quasiharmonic import __version__
+    from quasiharmonic.linsolve import available
+    from quasiharmonic.util import kernels
+
+    if kernels.extension is not None:
+        loops = "compiled"
+    elif os.environ.get("QUASIHARMONIC_PURE"):
+        loops = "in NumPy, because QUASIHARMONIC_PURE is set"
+    else:
+        loops = "in NumPy, because the extension is not built or does not load"
+    return "\n".join(
+        [
+            f"qhm {__version__}",
+            f"Python {platform.python_version()}, {platform.system()} {platform.machine()}",
+            ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "matplotlib")),
+            f"loops: {loops}",
+            f"linear solvers: {', '.join(available())}",
+        ]
+    )
+
+
 def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
     """Return the parser of the command, with the given subcommands."""
     parser = CommandParser(
@@ -186,5 +226,11 @@ def parser_of(names: Iterable[str]) -> argparse.ArgumentParser:
         dest="command", metavar="COMMAND", required=True, help=argparse.SUPPRESS, prog="qhm"
     )
     for name in names:
-        import_module(f"{__name__}.commands.{name}").add_parser(commands)
+        module = import_module(f"{__name__}.commands.{name}")
+        # A title, which the help leaves out, what the command does, the exit status, and examples.
+        _, description, epilog, examples = [*cleandoc(module.__doc__ or "").split("\n\n"), *[""] * 4][:4]
+        lines = [line.strip() for line in examples.splitlines()]
+        command = commands.add_parser(name, description=description, epilog=epilog, examples=lines)
+        command.set_defaults(run=module.run)
+        module.declare_arguments(command)
     return parser

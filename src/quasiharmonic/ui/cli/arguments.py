@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import Field, fields
-from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -15,38 +14,12 @@ from quasiharmonic.util import options
 from quasiharmonic.util.options import Options
 
 T = TypeVar("T")
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Option: TypeAlias = dict[str, Any]  # Keywords of `add_argument`
 
 # Copies of names in energies.measures, so that the parser does not import this module.
-MEASURES = (
-    "sigma1",
-    "sigma2",
-    "mips",
-    "conformal",
-    "isometric",
-    "symmetric_dirichlet",
-    "arap",
-    "area_ratio",
-    "shear",
-)
+MEASURES = ("sigma1", "sigma2", "mips", "conformal", "isometric", "symmetric_dirichlet", "arap", "area_ratio", "shear")
 # Defaults for packing, in texels.
 RESOLUTION, PADDING = 1024, 4
-
-
-def add_command(
-    commands: Commands, name: str, text: str | None, run: Callable[[argparse.Namespace], int]
-) -> argparse.ArgumentParser:
-    """Declare a command, and return its parser.
-
-    ``text`` is the docstring of the command's module. It has four paragraphs: a title, which the help leaves out, what
-    the command does, the exit status, and examples.
-    """
-    _, description, epilog, examples = [*cleandoc(text or "").split("\n\n"), *[""] * 4][:4]
-    lines = tuple(line.strip() for line in examples.splitlines())
-    parser = commands.add_parser(name, description=description, epilog=epilog, examples=lines)
-    parser.set_defaults(run=run)
-    return parser
 
 
 def flag(words: str) -> Option:
@@ -74,7 +47,7 @@ def number(kind: Callable[[str], Any], words: str, *, metavar: str | tuple[str, 
     return {"type": kind, "metavar": metavar, "help": words, **rest}
 
 
-def declared(operation: type[Options]) -> dict[str, Option]:
+def declare_options(operation: type[Options]) -> dict[str, Option]:
     """Return the options of an operation: the fields that its class itself declares with a help text, in their order.
 
     Options of base classes are shared, and commands list these last.
@@ -165,7 +138,7 @@ def byte_count(text: str) -> int:
     return int(value)
 
 
-def welding(text: str) -> bool | float:
+def convert_welding(text: str) -> bool | float:
     """Convert yes, no or a distance; for argparse."""
     if text in ("yes", "no"):
         return text == "yes"
@@ -185,7 +158,7 @@ def weld(default: str) -> Option:
         "weld vertices: yes, at equal positions; no; or a distance relative to the diagonal of the bounding box, such "
         "as 1e-6 (default: %(default)s)"
     )
-    return number(welding, words, metavar="WHICH", default=default)
+    return number(convert_welding, words, metavar="WHICH", default=default)
 
 
 def degrees(text: str) -> float:
@@ -203,8 +176,8 @@ def _island_list(text: str) -> list[int]:
 
 #: The options that several commands take with the same meaning.
 SHARED: dict[str, Option] = {
-    **declared(options.SolverOptions),
-    **declared(options.MapOptions),
+    **declare_options(options.SolverOptions),
+    **declare_options(options.MapOptions),
     "fixed": file("file of fixed vertices, 0-based, one per line (default: the boundary)"),
     "font": text("FONT", "for letters and words: a font file or the name of a font"),
     "corners": text(

@@ -15,12 +15,10 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from quasiharmonic.ui.cli.streams import require_output, tell
+from quasiharmonic.ui.cli.process import tell
 
 if TYPE_CHECKING:
-    from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.problem import Domain
-    from quasiharmonic.ui.cli.written_map import WrittenMap
 
 _options: ContextVar[Mapping[str, str] | None] = ContextVar("options", default=None)
 
@@ -45,13 +43,12 @@ def use_options(parser: argparse.ArgumentParser, command: str) -> None:
 
 def list_options(parser: argparse.ArgumentParser, command: str) -> dict[str, str]:
     """Return the options of a subcommand by the names of their values."""
+    (subcommands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
     options = {}
-    for subcommands in parser._actions:
-        if isinstance(subcommands, argparse._SubParsersAction) and command in subcommands.choices:
-            for action in subcommands.choices[command]._actions:
-                long = [option for option in action.option_strings if option.startswith("--")]
-                if long:
-                    options[action.dest] = long[0]
+    for action in subcommands.choices[command]._actions:
+        long = [option for option in action.option_strings if option.startswith("--")]
+        if long:
+            options[action.dest] = long[0]
     return options
 
 
@@ -61,40 +58,22 @@ def in_options(text: str) -> str:
     if not options:
         return text
 
-    def assigned(found: re.Match[str]) -> str:
+    def replace_assigned(found: re.Match[str]) -> str:
         if found[1] not in options:
             return found[0]
         value = found[2].strip("'")
         return options[found[1]] if value in ("True", "False") else f"{options[found[1]]} {value}"
 
-    def listed(found: re.Match[str]) -> str:
+    def replace_listed(found: re.Match[str]) -> str:
         return f"{found[1]} " + re.sub(r"[a-z_]+", lambda name: options.get(name[0], name[0]), found[2])
 
-    text = _LISTED.sub(listed, _ASSIGNED.sub(assigned, text))
+    text = _LISTED.sub(replace_listed, _ASSIGNED.sub(replace_assigned, text))
     return _NAME.sub(lambda found: options.get(found[0], found[0]), text)
 
 
 def sizes(domain: Domain) -> dict[str, Any]:
     """Return the numbers of vertices, triangles and fixed vertices."""
     return {"vertices": domain.n, "triangles": len(domain.F), "fixed": len(domain.fixed)}
-
-
-def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str:
-    """Return the text report of a map that was computed and written."""
-    from quasiharmonic.problem.result import Status
-    from quasiharmonic.util.arrays import count_of
-
-    lines = [f"wrote {output}: {written.summary()}"]
-    results = [island.result for island in mapped.islands]
-    if not written.injective:
-        lines.append(mapped.status.value)
-    # Each surface may be injective although pins make an overlap between surfaces unavoidable.
-    if not written.injective or mapped.status is Status.IMPOSSIBLE:
-        lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
-    iterations = sum(result.n_iterations for result in results)
-    seconds = sum(result.seconds for result in results)
-    lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
-    return "\n".join(lines)
 
 
 def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
@@ -113,16 +92,6 @@ def emit(facts: dict[str, Any], destination: str | None, text: str) -> None:
     print(text, flush=True)
 
 
-def emit_verdict(facts: dict[str, Any], destination: str | None, text: str) -> None:
-    """`emit` for a command that writes no file.
-
-    BrokenPipeError when standard output is closed and ``--json`` names no file, so that nobody can read the report.
-    """
-    if destination is None:
-        require_output()
-    emit(facts, destination, text)
-
-
 def check_outputs(options: argparse.Namespace, inputs: Sequence[Path | None]) -> None:
     """Check before any work that outputs can be written and do not replace other files.
 
@@ -133,38 +102,33 @@ def check_outputs(options: argparse.Namespace, inputs: Sequence[Path | None]) ->
     from quasiharmonic import io
 
     io.check_output(options.output)
-    plot, pattern = getattr(options, "plot", None), getattr(options, "pattern", None)
-    if plot is not None:
-        check_picture("--plot", plot, inputs)
-    outputs = {"--plot": plot, "--pattern": pattern, "--json": _json_file(options.json)}
-    _check_distinct(outputs, inputs, {options.output: "the map (-o)"})
+    outputs = {f"--{name}": getattr(options, name, None) for name in ("plot", "pattern")}
+    if outputs["--plot"] is not None:
+        check_picture("--plot", outputs["--plot"], inputs)
+    check_new(outputs, options.json, inputs, {options.output: "the map (-o)"})
 
 
-def _json_file(json_path: str | None) -> Path | None:
-    """Return the file of ``--json``, if it names one."""
-    return None if json_path in (None, "-") else Path(str(json_path))
+def check_new(
+    outputs: Mapping[str, Path | None],
+    json_path: str | None,
+    inputs: Sequence[Path | None],
+    others: Mapping[Path, str] | None = None,
+) -> None:
+    """Like `check_outputs`, for files that must replace neither an input nor each other.
 
-
-def check_moved(output: Path, json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """Like `check_outputs`, for a mesh in a format whose suffix another library checks."""
-    _check_replaces_nothing("-o", output, inputs)
-    check_new({}, json_path, (*inputs, output))
-
-
-def check_new(outputs: Mapping[str, Path | None], json_path: str | None, inputs: Sequence[Path | None]) -> None:
-    """Like `check_outputs`, for files that must not replace any input.
-
-    ``outputs`` maps descriptions to paths, or to None.
+    ``outputs`` maps descriptions to paths, or to None. ``others`` are outputs that are already checked, with their
+    descriptions.
     """
-    _check_distinct({**outputs, "--json": _json_file(json_path)}, inputs, {})
+    from quasiharmonic import io
 
-
-def _check_distinct(outputs: Mapping[str, Path | None], inputs: Sequence[Path | None], taken: dict[Path, str]) -> None:
-    """Check that outputs replace neither an input nor each other, nor the outputs ``taken`` with their descriptions."""
-    for what, path in outputs.items():
+    taken = dict(others or {})
+    json_file = None if json_path in (None, "-") else Path(str(json_path))
+    for what, path in {**outputs, "--json": json_file}.items():
         if path is None:
             continue
-        _check_replaces_nothing(what, path, inputs)
+        io.check_writable(path)
+        if any(_is_same_file(path, source) for source in inputs if source is not None):
+            raise ValueError(f"{what} {path} would replace an input file")
         for other, name in taken.items():
             if _is_same_file(path, other):
                 raise ValueError(f"{what} {path} is also the file of {name}")
@@ -177,23 +141,7 @@ def check_picture(
     """Like `check_outputs`, for a picture."""
     if path.suffix.lower() not in endings:
         raise ValueError(f"{option} {path}: pictures are written as {', '.join(endings)}")
-    _check_replaces_nothing(option, path, inputs)
-
-
-def check_export(path: Path, inputs: Sequence[Path | None]) -> None:
-    """Like `check_outputs`, for values per triangle."""
-    from quasiharmonic import io
-
-    io.find_format(path, "encode_values")
-    _check_replaces_nothing("--export", path, inputs)
-
-
-def _check_replaces_nothing(option: str, path: Path, inputs: Sequence[Path | None]) -> None:
-    from quasiharmonic import io
-
-    io.check_writable(path)
-    if any(_is_same_file(path, source) for source in inputs if source is not None):
-        raise ValueError(f"{option} {path} would replace an input file")
+    check_new({option: path}, None, inputs)
 
 
 def _is_same_file(path: Path, other: Path) -> bool:
@@ -211,18 +159,13 @@ def name_source(source: Path | str) -> Iterator[None]:
 
     try:
         yield
-    except MeshFileError:
-        raise
     except ValueError as error:
-        if str(error).endswith(_COUNTING):
-            # An inner block has already added the prefix.
+        text = str(error)
+        if isinstance(error, MeshFileError) or text.startswith(f"{source}:") or text.endswith(_COUNTING):
+            # The error names its file, or an inner block has named it.
             raise
-        if str(error).startswith(f"{source}:"):
-            # The error already names its file.
-            raise
-        numbered = _NUMBERED.search(str(error)) and not _NEEDS_NO_NOTE.search(str(error))
-        counting = f" {_COUNTING}" if numbered else ""
-        raise ValueError(f"{source}: {error}{counting}") from error
+        numbered = _NUMBERED.search(text) and not _NEEDS_NO_NOTE.search(text)
+        raise ValueError(f"{source}: {text}{f' {_COUNTING}' if numbered else ''}") from error
 
 
 def describe_error(error: Exception) -> str:

@@ -3,12 +3,10 @@
 The package builds on `geometry` and `problem`. Start reading in `canvas`, then `maps`.
 """
 
-from quasiharmonic.ui.plot.animation import save_animation, save_figures
-from quasiharmonic.ui.plot.boundary import save_boundary_figure
-from quasiharmonic.ui.plot.convergence import plot_convergence
+from quasiharmonic.ui.plot.animation import plot_convergence, save_animation, save_figures
+from quasiharmonic.ui.plot.boundary import plot_problem, save_boundary_figure
 from quasiharmonic.ui.plot.distortion import plot_distortion, save_distortion_figure
 from quasiharmonic.ui.plot.maps import plot_before_after, plot_map, plot_surface, save_map_figure
-from quasiharmonic.ui.plot.problem_figure import plot_problem
 from quasiharmonic.ui.plot.texture import plot_texture, save_texture_figure
 
 __all__ = [

@@ -1,30 +1,48 @@
-"""Figures of a surface with numbered boundary vertices; numbers that would overlap are omitted."""
+"""Figures of boundaries: a surface with numbered boundary vertices, and a problem with the targets of its vertices.
+
+Numbers that would overlap are omitted.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from os import PathLike
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.io.adapters.accepts_mesh import writer_accepts_mesh
+from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import (
     BORDER,
     INK,
     RED,
     as_mesh,
     caption,
+    draw_edges,
+    draw_pins,
     fit,
     new_figure,
     paint_surface,
+    panels,
     save_picture,
+    scale_for_drawing,
+    view,
 )
-from quasiharmonic.ui.plot.shading import view
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, loop_arrays
+from quasiharmonic.util.arrays import (
+    FloatArray,
+    IntArray,
+    check_range,
+    fixed_vertices,
+    index_array,
+    loop_arrays,
+    target_positions,
+)
 
-# Side of the figure in inches.
-_INCHES = 10.0
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 # Size of the numbers in points.
 _FONT_SIZE = 7.5
 # Width of a digit, in units of the font size.
@@ -66,7 +84,7 @@ def save_boundary_figure(
     seen, marked = view(rest, F), index_array("corners", corners)
     loops = loop_arrays(loops, len(rest))
     check_range("corners", marked, len(rest))
-    figure = new_figure((_INCHES, _INCHES))
+    figure = new_figure((10, 10))
     ax = figure.add_axes((0.04, 0.02, 0.92, 0.9))
     # Pale colours keep the numbers readable.
     paint_surface(ax, seen, F, 0.4 * seen.color + 0.6)
@@ -109,3 +127,52 @@ def _find_readable(centres: FloatArray, half: FloatArray) -> list[int]:
         if apart.any(axis=1).all():
             chosen.append(k)
     return chosen
+
+
+@accepts_mesh
+def plot_problem(
+    V: ArrayLike, F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, vertices: ArrayLike = (), edges: ArrayLike = ()
+) -> Figure:
+    """Draw a surface beside the targets of its fixed vertices: boundary edges as lines, pins as dots.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) array, or a mesh in place of ``V`` and ``F``
+    F : (f, 3) array of int
+    fixed : (k,) array of int
+        The boundary and any pins.
+    target : (k, 2) array
+        Target positions of the fixed vertices.
+    vertices : (a,) array of int
+    edges : (b, 2) array of int
+        Vertices and edges to mark in red, as a diagnosis lists them. In the plane only fixed ones are marked.
+
+    Returns
+    -------
+    matplotlib Figure
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape, contains an invalid index, or is not finite.
+    """
+    rest, F = as_mesh(V, F)
+    held = fixed_vertices(fixed, len(rest))
+    places = np.full((len(rest), 2), np.nan)
+    places[held] = scale_for_drawing(target_positions(target, len(held)))
+    border, marked = boundary_edges(F, len(rest)), index_array("vertices", vertices)
+    pairs = index_array("edges", edges).reshape(-1, 2)
+    check_range("vertices", marked, len(rest))
+    check_range("edges", pairs, len(rest))
+    figure, seen = new_figure((8, 4.5)), view(rest, F)
+    surface, plane = panels(figure, 2)
+    paint_surface(surface, seen, F, seen.color)
+    caption(surface, f"surface: {len(F):,} triangles")
+    fit(plane, places[held])
+    draw_edges(plane, places, border, zorder=6)
+    draw_pins(plane, places[np.setdiff1d(held, border)])
+    caption(plane, f"where {len(held):,} vertices go")
+    for ax, points in ((surface, seen.points), (plane, places)):
+        draw_edges(ax, points, pairs, RED, 2 * BORDER, zorder=6)
+        ax.plot(*points[marked].T, "o", markersize=5, color=RED, zorder=7)
+    return figure

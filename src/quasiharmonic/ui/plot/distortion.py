@@ -21,8 +21,9 @@ from quasiharmonic.ui.plot.canvas import (
     paint_map,
     paint_surface,
     save_picture,
+    shade,
+    view,
 )
-from quasiharmonic.ui.plot.shading import lit, view
 from quasiharmonic.util.arrays import FloatArray, check_choice, map_array
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     seen = view(rest, F)
     tinted = color.copy()
     tinted[found.inverted] = RED
-    paint_surface(surface, seen, F, lit(tinted, seen.light))
+    paint_surface(surface, seen, F, shade(tinted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
     paint_map(plane, F, uv, color, found.inverted)
     many = len(found.inverted)

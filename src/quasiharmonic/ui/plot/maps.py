@@ -10,17 +10,18 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import (
+    View,
     as_mesh,
     caption,
+    find_not_positive,
     new_figure,
-    not_positive,
     paint_map,
     paint_surface,
     panels,
     save_picture,
     verdict,
+    view,
 )
-from quasiharmonic.ui.plot.shading import View, view
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_range, index_array, map_array
 
 if TYPE_CHECKING:
@@ -96,12 +97,7 @@ def plot_map(
 
 @accepts_mesh
 def plot_before_after(
-    V: ArrayLike,
-    F: ArrayLike,
-    before: ArrayLike,
-    after: ArrayLike,
-    *,
-    fixed: ArrayLike | None = None,
+    V: ArrayLike, F: ArrayLike, before: ArrayLike, after: ArrayLike, *, fixed: ArrayLike | None = None
 ) -> Figure:
     """Draw two maps of one surface side by side, inverted triangles in red.
 
@@ -189,15 +185,10 @@ def map_figure(
 
 
 def _draw_map(
-    ax: Axes,
-    seen: View,
-    F: IntArray,
-    uv: FloatArray,
-    inverted: ArrayLike | None,
-    fixed: ArrayLike | None,
+    ax: Axes, seen: View, F: IntArray, uv: FloatArray, inverted: ArrayLike | None, fixed: ArrayLike | None
 ) -> int:
     """Draw a map into axes and return the number of its inverted triangles."""
-    marked = _check_inverted(inverted, len(F)) if inverted is not None else not_positive(F, uv)
+    marked = _check_inverted(inverted, len(F)) if inverted is not None else find_not_positive(F, uv)
     paint_map(ax, F, uv, seen.color, marked, fixed)
     return int(marked.size)
 

@@ -19,13 +19,15 @@ from quasiharmonic.ui.plot.canvas import (
     as_mesh,
     caption,
     draw_edges,
+    find_not_positive,
     new_figure,
-    not_positive,
     panels,
     save_picture,
+    scale_for_drawing,
+    shade,
     verdict,
+    view,
 )
-from quasiharmonic.ui.plot.shading import lit, scale_for_drawing, view
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, enumerate_each, map_array
 from quasiharmonic.util.optional import explain_missing
 
@@ -88,7 +90,7 @@ def plot_texture(
         board, color = (uv - low) / size * squares, _checkerboard_color
     else:
         board, color = uv, _make_image_color(texture)
-    inverted = not_positive(F, uv)
+    inverted = find_not_positive(F, uv)
     seen = view(rest, F)
     figure = new_figure((9.6, 4.8))
     surface, plane = panels(figure, 2)
@@ -174,7 +176,7 @@ def _render(
         nearest[pixel] = z
         color = color_at(np.einsum("kc,kcd->kd", weights, board_of.take(triangle, axis=0)))
         color[bad[triangle]] = RED
-        colors[pixel] = lit(color, light[triangle])
+        colors[pixel] = shade(color, light[triangle])
     grid = colors.reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES, 3)[::-1]
     covered = np.isfinite(nearest).reshape(_SIDE, _SAMPLES, _SIDE, _SAMPLES)[::-1]
     # Adding the few samples of a pixel one by one is much faster than a sum over two axes.

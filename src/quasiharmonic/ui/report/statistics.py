@@ -116,13 +116,10 @@ def find_worst(values: FloatArray) -> float:
 
 def outcomes(run: BatchRun) -> list[tuple[str, int]]:
     """Return the number of records per outcome, in the order of `records.OUTCOMES`; unknown outcomes come last."""
-    counted = Counter(str(row.get("outcome") or _guess(row)) for row in run.rows)
+    guesses = {True: "injective", False: "not injective"}
+    counted = Counter(str(row.get("outcome") or guesses[row.get("certified") is True]) for row in run.rows)
     order = [*records.OUTCOMES, *sorted(set(counted) - set(records.OUTCOMES))]
     return [(name, counted[name]) for name in order if counted[name]]
-
-
-def _guess(row: Record) -> str:
-    return "injective" if row.get("certified") is True else "not injective"
 
 
 def match_column(run: BatchRun, other: BatchRun, column: str) -> tuple[FloatArray, FloatArray]:

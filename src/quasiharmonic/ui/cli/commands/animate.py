@@ -17,8 +17,16 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, report, written_map
-from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, count, flag, number, pick, set_default
+from quasiharmonic.ui.cli import pipeline, report
+from quasiharmonic.ui.cli.arguments import (
+    add_options,
+    choice,
+    count,
+    flag,
+    number,
+    pick,
+    set_default,
+)
 from quasiharmonic.util.options import ENERGIES
 
 if TYPE_CHECKING:
@@ -27,16 +35,14 @@ if TYPE_CHECKING:
 
     from quasiharmonic.apps.animation.frames import Animation, FrameStep
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 PICTURES = ".gif", ".mp4"
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "animate", __doc__, run)
     parser.add_argument("input", type=Path, metavar="INPUT", help=f"{format_names('read')} file: the surface")
     parser.add_argument(
         "targets",
@@ -99,7 +105,7 @@ def run(options: argparse.Namespace) -> int:
     with report.name_source(options.input):
         problem = Problem(mesh.V, mesh.F, fixed, positions[0])
     given = pick(options, "polish", "max_motion_ratio", "fill_gaps", "max_iterations", "linear_solver")
-    with pipeline.working(options.input, _words) as show:
+    with pipeline.show_work(options.input, _words) as show:
         animation = animate(problem, positions, callback=show, **given)
     if not animation.frames:
         raise KeyboardInterrupt
@@ -218,7 +224,7 @@ def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[b
             with report.after_writing(folder / min(written)) if written else nullcontext():
                 io.write_mapped(path, mesh.with_map(frame.uv))
                 written.add(path.name)
-                certified &= written_map.certify_map(io.read_mesh(path)).injective
+                certified &= pipeline.certify_map(io.read_mesh(path)).injective
     others = {path.name for path in folder.glob("*.obj") if path.stem.isdecimal()} - written
     return certified, sorted(others)
 

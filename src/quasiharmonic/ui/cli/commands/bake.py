@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline
 from quasiharmonic.ui.cli.arguments import (
-    add_command,
     add_files,
     add_options,
-    declared,
+    declare_options,
     number,
     pick,
     texture_size,
@@ -30,14 +29,12 @@ from quasiharmonic.util.options import BakeOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "bake", __doc__, run)
     add_files(
         parser,
         f"{format_names('read')} file with the look",
@@ -48,7 +45,7 @@ def add_parser(commands: Commands) -> None:
     sides = number(
         texture_size, "side of the textures in texels, or WIDTHxHEIGHT (default: 2048)", default=(2048, 2048)
     )
-    add_options(parser, size=sides, **declared(BakeOptions))
+    add_options(parser, size=sides, **declare_options(BakeOptions))
     add_options(parser, "json")
 
 
@@ -71,8 +68,8 @@ def _bake(options: argparse.Namespace, new: MeshData) -> pipeline.Changed:
     from quasiharmonic.apps.baking.bake import bake
 
     old = _read(options, options.input)
-    with pipeline.working(options.new):
-        result = bake(old, new, **pick(options, "size", *declared(BakeOptions)))
+    with pipeline.show_work(options.new):
+        result = bake(old, new, **pick(options, "size", *declare_options(BakeOptions)))
 
     def describe(_: MeshData) -> pipeline.Account:
         facts = {**result.to_dict(), "new": str(options.new)}

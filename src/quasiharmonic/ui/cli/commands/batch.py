@@ -23,16 +23,15 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import report, streams, targets
+from quasiharmonic.ui.cli import map_options, process, report
 from quasiharmonic.ui.cli.arguments import (
     SHARED,
-    add_command,
     add_options,
     byte_count,
     choice,
     convert,
     count,
-    declared,
+    declare_options,
     file,
     flag,
     number,
@@ -40,22 +39,20 @@ from quasiharmonic.ui.cli.arguments import (
     text,
     texture_size,
 )
-from quasiharmonic.ui.cli.streams import tell
+from quasiharmonic.ui.cli.process import tell
 from quasiharmonic.util.options import ENERGIES, FLATTENED, MAP_FORMATS, DescentOptions, UnwrapOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.ui.batch import Progress
-    from quasiharmonic.ui.cli.arguments import Commands
 
-# Options of `unwrap` that are options of a run.
-_OF_RUNS = "jobs", "time_limit"
+# The options of `unwrap` that are not options of a run.
+_UNWRAP = {name: one for name, one in declare_options(UnwrapOptions).items() if name not in ("jobs", "time_limit")}
 #: Seconds between two updates of the line on a terminal.
 LIVE = 0.1
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
-    parser = add_command(commands, "batch", __doc__, run)
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     parser.add_argument(
         "source",
         metavar="DIR_OR_LIST",
@@ -118,7 +115,7 @@ def add_parser(commands: Commands) -> None:
     solver = parser.add_argument_group("solution of each problem, as for qhm map or qhm flatten")
     add_options(
         solver,
-        to=text("OUTLINE", f"map every mesh file onto an outline: {targets.FORMS}"),
+        to=text("OUTLINE", f"map every mesh file onto an outline: {map_options.FORMS}"),
         flatten=flag("flatten every mesh file with a free boundary, without overlap"),
         cut=flag("with --to and --flatten: cut surfaces that cannot be flattened, along seams"),
         start=flag("for --flatten: start from the map in the files' texture coordinates"),
@@ -134,7 +131,7 @@ def add_parser(commands: Commands) -> None:
     }
     add_options(solver, "font", **of_outlines)
     add_options(solver, "pieces", "refine", strategy=SHARED["strategy"] | {"default": None})
-    add_options(solver, **declared(DescentOptions))
+    add_options(solver, **declare_options(DescentOptions))
     add_options(solver, "reference", "max_iterations", "linear_solver")
     models = parser.add_argument_group("texture coordinates of each model, as for qhm unwrap")
     add_options(
@@ -142,7 +139,7 @@ def add_parser(commands: Commands) -> None:
         unwrap=flag("unwrap every mesh file: charts with little stretch, packed into a texture"),
         resolution=number(texture_size, "side of the texture in texels, or WIDTHxHEIGHT (default: 2048)"),
         # The defaults are those of `unwrap`; the limits of a run are options of their own.
-        **{name: one | {"default": None} for name, one in declared(UnwrapOptions).items() if name not in _OF_RUNS},
+        **{name: one | {"default": None} for name, one in _UNWRAP.items()},
     )
 
 
@@ -172,7 +169,7 @@ def run(options: argparse.Namespace) -> int:
     rest = pick(options, "retry", "table", "shard", "scheduler")
     time_limit = options.time_limit or None
     try:
-        with streams.progress_line(_words, live=LIVE) as show:
+        with process.progress_line(_words, live=LIVE) as show:
             progress = batch.run(
                 options.source, options.output, settings, time_limit=time_limit, callback=show, **limits, **rest
             )
@@ -193,8 +190,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _unwrap_options(options: argparse.Namespace) -> dict[str, Any] | None:
     """Return the given options of `unwrap`, or None without --unwrap."""
-    names = ["resolution", *(name for name in declared(UnwrapOptions) if name not in _OF_RUNS)]
-    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    given = {name: value for name, value in pick(options, "resolution", *_UNWRAP).items() if value is not None}
     if options.unwrap:
         return given | ({"symmetry": None} if given.get("symmetry") == "none" else {})
     for name in given:
@@ -239,9 +235,7 @@ def _write_report(options: argparse.Namespace) -> int:
     folder = output if output.is_dir() else output.parent
     page = folder / "report.html"
     write_report(page, output, options.against)
-    with report.after_writing(page):
-        print(f"wrote {page}", flush=True)
-    return 0
+    return report.tell_written(page)
 
 
 def _account(progress: Progress, wanted: str, table: str) -> str:

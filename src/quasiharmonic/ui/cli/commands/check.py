@@ -19,8 +19,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import finite_elements, pipeline, report, written_map
-from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, flag, weld
+from quasiharmonic.ui.cli import finite_elements, pipeline, report
+from quasiharmonic.ui.cli.arguments import add_options, choice, file, flag, weld
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from quasiharmonic.problem.diagnosis import Diagnosis
     from quasiharmonic.problem.inspection import MeshReport
     from quasiharmonic.targets import BoundaryLoop
-    from quasiharmonic.ui.cli.arguments import Commands
-    from quasiharmonic.ui.cli.written_map import WrittenMap
+    from quasiharmonic.ui.cli.pipeline import WrittenMap
 
 # Maximum number of corners per loop.
 _MAX_CORNERS = 12
@@ -41,11 +40,10 @@ _MIN_TURN = 20.0
 _LISTED = 100
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "check", __doc__, run)
     parser.add_argument(
         "input",
         type=Path,
@@ -123,15 +121,10 @@ def _verify(
 ) -> tuple[bool, dict[str, Any], list[str]]:
     """Certify the map of a mesh; return whether it passes, the entries of the report, and its text."""
     precision = options.precision or "float64"
-    certified = written_map.certify_map(mesh, precision=precision, weld=options.weld)
+    certified = pipeline.certify_map(mesh, precision=precision, weld=options.weld)
     further = len(certified.V) - len(mesh.V)
     good = certified.injective
-    facts = {
-        **certified.to_dict(),
-        "precision": precision,
-        "triangles": len(mesh.F),
-        "further_places": further,
-    }
+    facts = {**certified.to_dict(), "precision": precision, "triangles": len(mesh.F), "further_places": further}
     lines = [certified.summary()]
     if further:
         lines.append(f"The map has seams: vertices from {len(mesh.V)} on are copies of vertices on the seams.")
@@ -213,10 +206,7 @@ def _list_boundary(options: argparse.Namespace) -> int:
         marked = [corner["vertex"] for loop in described for corner in loop["corners"]]
         save_boundary_figure(options.plot, mesh.V, mesh.F, [loop.vertices for loop in loops], np.array(marked))
         text.append(f"wrote {options.plot}")
-    account = pipeline.Account(facts, text)
-    if options.plot is None:
-        return pipeline.conclude(options, account)
-    return pipeline.finish(options, lambda: account, options.plot)
+    return pipeline.conclude(options, pipeline.Account(facts, text), options.plot)
 
 
 def _describe_loop(loop: BoundaryLoop, V: NDArray[np.float64]) -> dict[str, Any]:

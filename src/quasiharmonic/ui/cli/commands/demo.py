@@ -13,19 +13,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-from quasiharmonic.ui.cli.arguments import add_command
-
-if TYPE_CHECKING:
-    from quasiharmonic.ui.cli.arguments import Commands
 
 LETTER = "R"
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
-    parser = add_command(commands, "demo", __doc__, run)
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("qhm-demo"), metavar="DIR", help="folder to write to (qhm-demo)"
     )
@@ -39,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.problem import Problem
     from quasiharmonic.solver.mapping import solve
-    from quasiharmonic.ui.cli import report, streams, written_map
+    from quasiharmonic.ui.cli import pipeline, process, report
     from quasiharmonic.ui.cli.commands import map
 
     folder: Path = options.output
@@ -47,13 +40,13 @@ def run(options: argparse.Namespace) -> int:
     with io.new_folder(folder):
         V, F = surfaces.cat()
         problem = Problem(V, F, *targets.boundary_to(V, F, f"letter:{LETTER}"))
-        with streams.progress_line() as show:
+        with process.progress_line() as show:
             mapped = each_island(SeamedMesh(V, F), lambda _: solve(problem, callback=show))
         io.write_mapped(output, io.MeshData(V, F).with_places(mapped.mesh))
     with report.after_writing(output):
-        written = written_map.certify_map(io.read_mesh(output))
+        written = pipeline.certify_map(io.read_mesh(output))
         map.draw(folder / "demo.png", written, [problem], mapped)
         facts = {**mapped.to_dict(), **written.to_dict(), **report.sizes(problem.domain)}
-        report.emit(facts, str(folder / "demo.json"), report.describe_maps(mapped, written, output))
+        report.emit(facts, str(folder / "demo.json"), pipeline.describe_maps(mapped, written, output))
         print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)
     return 0 if written.injective else 1

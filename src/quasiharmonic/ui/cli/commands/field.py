@@ -22,21 +22,17 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, file, flag, number
+from quasiharmonic.ui.cli.arguments import add_files, add_options, choice, file, flag, number
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import numpy as np
     from numpy.typing import NDArray
 
     from quasiharmonic.io.fields import DisplacementField
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
-    parser = add_command(commands, "field", __doc__, run)
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     add_files(parser, ".npy, .nii, .nii.gz, .mha or .nrrd file", "file to write, of the same kind")
     add_options(
         parser,
@@ -69,9 +65,11 @@ def add_parser(commands: Commands) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, make invertible, write, report."""
+    from quasiharmonic.apps.displacement_fields.field_inversion import inverse_field
     from quasiharmonic.apps.displacement_fields.nearest import InvertibleField, fold_free, nearest_invertible
     from quasiharmonic.apps.displacement_fields.voxels import describe_fixed
     from quasiharmonic.io.fields import field_suffix, read_field
+    from quasiharmonic.util.outcome import as_plain
 
     report.check_new({"-o": options.output, "--inverse": options.inverse}, options.json, inputs=(options.input,))
     outputs = [path for path in (options.output, options.inverse) if path is not None]
@@ -95,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
     if options.interpolation != "linear":
         _check_interpolation(repaired.field, spacing, options.interpolation)
     given.write(options.output, repaired.field)
-    invertible = bool(repaired.certificate.bijective if isinstance(repaired, InvertibleField) else repaired.bijective)
+    invertible = bool(repaired.certificate.bijective)
 
     def describe() -> pipeline.Account:
         # Rotation to the axes of space rounds, so the file is verified.
@@ -106,15 +104,14 @@ def run(options: argparse.Namespace) -> int:
             "injective": repaired.success,
             "bijective": invertible,
             "moved": int(repaired.moved_mask.sum()),
-            "folds": repaired.folds,
-            "patches": repaired.patches,
-            "distance": repaired.distance,
-            "seconds": repaired.seconds,
+            **as_plain(repaired, "folds", "patches", "distance", "seconds"),
             **pipeline.name_files(options),
         }
         lines = [f"wrote {options.output}: {repaired.summary()}"]
         if options.inverse is not None and invertible:
-            lines.append(_invert(options.inverse, given, written, spacing))
+            back = inverse_field(written, spacing=spacing)
+            given.write(options.inverse, back.field)
+            lines.append(f"wrote {options.inverse}: {back.summary()}")
             facts["inverse"] = str(options.inverse)
         elif options.inverse is not None:
             lines.append(f"{options.inverse} is not written: the field has no inverse")
@@ -147,15 +144,6 @@ def _check_interpolation(field: NDArray[np.float64], spacing: float | list[float
             f"{count_of('cell', 'cells', len(doubtful))} may fold with {interpolation} interpolation; the first voxels "
             f"(slice, row, column) of the first ones are {first}: give a larger --min-jacobian"
         )
-
-
-def _invert(path: Path, given: DisplacementField, field: NDArray[np.float64], spacing: float | list[float]) -> str:
-    """Write the inverse field, and return its summary."""
-    from quasiharmonic.apps.displacement_fields.field_inversion import inverse_field
-
-    back = inverse_field(field, spacing=spacing)
-    given.write(path, back.field)
-    return f"wrote {path}: {back.summary()}"
 
 
 def _border(field: NDArray[Any]) -> NDArray[np.bool_]:

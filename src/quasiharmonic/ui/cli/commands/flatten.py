@@ -20,13 +20,12 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import pipeline, report, seam_options, streams, written_map
+from quasiharmonic.ui.cli import map_options, pipeline, process, report
 from quasiharmonic.ui.cli.arguments import (
-    add_command,
     add_files,
     add_options,
     choice,
-    declared,
+    declare_options,
     file,
     flag,
     number,
@@ -39,22 +38,16 @@ from quasiharmonic.util.options import FlattenOptions
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
-# Distance between pieces, in allowances; with 2 or less the allowances would touch.
-_PIECE_GAP = 2.1
-
-
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "flatten", __doc__, run)
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map')} file to write")
     add_options(
         parser,
-        **declared(FlattenOptions),
+        **declare_options(FlattenOptions),
         weights=file("file of triangle weights, one positive number per line"),
         start=flag("start from the map in the input's texture coordinates (vt)"),
         fixed=file("file of vertices, 0-based, one per line, to fix at the input's vt"),
@@ -75,16 +68,14 @@ def add_parser(commands: Commands) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, flatten, write, read back, certify, report."""
     began = time.perf_counter()
-    seam_options.check_options(options)
-    seam_options.check_packing(options)
+    map_options.check_seams(options)
+    map_options.check_packing(options)
     set_default(options, "rings", 20, asked=options.energy == "distances", belongs="--energy distances")
     set_default(options, "unit", "mm", asked=options.pattern is not None, belongs="--pattern")
     _check_options(options)
     seams = None if options.seams in ("file", "none") else Path(options.seams)
     return pipeline.change_map(
-        options,
-        lambda mesh: _flatten(options, mesh, began),
-        inputs=(options.weights, options.fixed, seams),
+        options, lambda mesh: _flatten(options, mesh, began), inputs=(options.weights, options.fixed, seams)
     )
 
 
@@ -112,17 +103,18 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
         given["fixed"] = np.unique(joint[io.read_handles(options.fixed, len(mesh.V))])
     if options.weights is not None:
         given["weights"] = _weights(options.weights)
-    found = seam_options.surface(options, replace(mesh, F=F), disks_too=True, joint=joint)
+    found = map_options.surface(options, replace(mesh, F=F), disks_too=True, joint=joint)
     triangles = np.array([len(island.F) for island in found.mesh.islands])
     kept = np.flatnonzero(joint == np.arange(len(mesh.V)))
     if (close := kept[find_close_vertices(mesh.V[kept], triangles)]).size:
-        streams.tell(describe_soup(close))
-    given |= pick(options, "start", "rings", "islands", "linear_solver", *declared(FlattenOptions))
-    with pipeline.working(options.input) as show:
-        mapped = atlas.flatten(found.mesh, gap=_PIECE_GAP * options.allowance, callback=show, **given)
+        process.tell(describe_soup(close))
+    given |= pick(options, "start", "rings", "islands", "linear_solver", *declare_options(FlattenOptions))
+    with pipeline.show_work(options.input) as show:
+        # With a gap of at most two allowances, those of two pieces would touch.
+        mapped = atlas.flatten(found.mesh, gap=2.1 * options.allowance, callback=show, **given)
 
     def describe(written: MeshData) -> pipeline.Account:
-        certified = written_map.certify_map(written, weld=options.weld)
+        certified = pipeline.certify_map(written, weld=options.weld)
         # Some formats hold the map alone; their vertices have the numbers of the surface's.
         V = mesh.V if len(mesh.V) == len(certified.V) else certified.V
         flat = io.without_idle(V, certified.F, certified.uv)
@@ -142,7 +134,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
         }
         worst = measured.statistics("isometric").maximum
         lines = [
-            report.describe_maps(mapped, certified, options.output),
+            pipeline.describe_maps(mapped, certified, options.output),
             *found.notes,
             f"maximum stretch {worst:.3g}",
         ]
@@ -156,7 +148,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
             lines.append(f"wrote {options.pattern}, true to scale")
         return pipeline.Account(facts, [*lines, mapped.status.value], certified.apart)
 
-    return pipeline.Changed(mesh.with_places(seam_options.pack_islands(options, mapped.mesh)), describe)
+    return pipeline.Changed(mesh.with_places(map_options.pack_islands(options, mapped.mesh)), describe)
 
 
 def _check_options(options: argparse.Namespace) -> None:

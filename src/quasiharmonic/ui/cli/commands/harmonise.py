@@ -15,27 +15,25 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, declared, flag, number
+from quasiharmonic.ui.cli.arguments import add_files, add_options, declare_options, flag, number
 from quasiharmonic.ui.cli.commands import polish
 from quasiharmonic.util.options import HarmoniseOptions
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.io.seamed_mesh import SeamedMesh
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "harmonise", __doc__, run)
     form = format_names("write_map")
     add_files(parser, f"{form} file with a map", f"{form} file to write")
     add_options(
         parser,
         "fixed",
-        **declared(HarmoniseOptions),
+        **declare_options(HarmoniseOptions),
         eta=number(
             float,
             "weight of the energy against injectivity, one for each round (default: four rounds, "

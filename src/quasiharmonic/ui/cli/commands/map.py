@@ -18,13 +18,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, report, seam_options, streams, targets, written_map
+from quasiharmonic.ui.cli import map_options, pipeline, process, report
 from quasiharmonic.ui.cli.arguments import (
-    add_command,
     add_files,
     add_options,
     choice,
-    declared,
+    declare_options,
     file,
     flag,
     pick,
@@ -41,22 +40,20 @@ if TYPE_CHECKING:
     from quasiharmonic.io.seamed_mesh import Island
     from quasiharmonic.problem import Problem
     from quasiharmonic.problem.result import MapResult
-    from quasiharmonic.ui.cli.arguments import Commands
-    from quasiharmonic.ui.cli.targets import IslandProblem
-    from quasiharmonic.ui.cli.written_map import WrittenMap
+    from quasiharmonic.ui.cli.map_options import IslandProblem
+    from quasiharmonic.ui.cli.pipeline import WrittenMap
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "map", __doc__, run)
     add_files(
         parser,
         f"{format_names('read')} file, or a folder with input.obj and handles.txt",
         f"{format_names('write_map')} file to write",
     )
-    targets.add_options(parser)
+    map_options.add_options(parser)
     kind = "for --plot: draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂) with its histogram"
     add_options(
         parser,
@@ -76,7 +73,7 @@ def add_parser(commands: Commands) -> None:
     )
     add_options(parser, "slide", "pieces")
     solver = parser.add_argument_group("solution")
-    add_options(solver, *declared(MapOptions), **declared(DescentOptions))
+    add_options(solver, *declare_options(MapOptions), **declare_options(DescentOptions))
     add_options(solver, "reference", "linear_solver")
 
 
@@ -87,8 +84,8 @@ def run(options: argparse.Namespace) -> int:
     began = time.perf_counter()
     if options.slide and options.no_polish:
         raise ValueError("--slide needs polishing: omit --no-polish")
-    targets.check_pieces(options)
-    seam_options.check_packing(options)
+    map_options.check_pieces(options)
+    map_options.check_packing(options)
     set_default(options, "kind", "map", asked=options.plot is not None, belongs="--plot")
     source, fixed = io.problem_files(options.input, options.fixed)
     if options.to is not None:
@@ -98,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
         options,
         lambda mesh: _map(options, mesh, source, fixed, began),
         source=source,
-        inputs=(fixed, *targets.files(options)),
+        inputs=(fixed, *map_options.files(options)),
     )
 
 
@@ -113,31 +110,32 @@ def _map(
     from quasiharmonic.solver.mapping import solve
     from quasiharmonic.solver.refine.attempts import on_refinement
     from quasiharmonic.solver.search.stages import select_strategy
+    from quasiharmonic.util.arrays import names_of
 
-    strategy = select_strategy(options.strategy, **pick(options, *declared(DescentOptions)))
+    strategy = select_strategy(options.strategy, **pick(options, *declare_options(DescentOptions)))
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
-    targets.check_options(options, mesh, fixed)
-    found = seam_options.surface(options, mesh, disks_too=False)
+    map_options.check_options(options, mesh, fixed)
+    found = map_options.surface(options, mesh, disks_too=False)
     islands = found.mesh.islands
     if len(islands) > 1 and options.slide and options.to is not None:
         raise ValueError(f"--slide supports one island, but the mesh has {len(islands)}")
     posed: list[IslandProblem] = []
 
     def solve_island(island: Island) -> MapResult:
-        one = targets.make_problem(options, island, fixed, len(posed))
+        one = map_options.make_problem(options, island, fixed, len(posed))
         posed.append(one)
         problem = one.fitted.problem
-        given = pick(options, "polish", "linear_solver", *declared(MapOptions))
+        given = pick(options, "polish", "linear_solver", *declare_options(MapOptions))
         given["strategy"] = strategy
         slide = one.slide if options.polish else False
-        with streams.progress_line() as show:
+        with process.progress_line() as show:
             result = solve(problem, slide=slide, callback=show, **given)
         if result.status is Status.INTERRUPTED and not result.history:
             raise KeyboardInterrupt
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
             # The short default polish lowers the worst distortion at little cost.
             fine = on_refinement(problem, result.refined)
-            with streams.progress_line() as show:
+            with process.progress_line() as show:
                 result = smooth(fine, result, linear_solver=options.linear_solver, callback=show, slide=one.slide)
         return result
 
@@ -149,10 +147,10 @@ def _map(
     if any(refined):
         new = merge_refined(mesh, mapped.mesh.islands, refined, mapped.places())
     if options.pack:
-        new = new.with_places(seam_options.pack_islands(options, io.mapped(new)))
+        new = new.with_places(map_options.pack_islands(options, io.mapped(new)))
 
     def describe(written: MeshData) -> pipeline.Account:
-        certified = written_map.certify_map(written)
+        certified = pipeline.certify_map(written)
         if options.plot is not None:
             problems = zip((one.fitted.problem for one in posed), refined, strict=False)
             draw(options.plot, certified, [on_refinement(*one) for one in problems], mapped, options.kind)
@@ -175,21 +173,15 @@ def _map(
         if added:
             notes.append(f"split {added} {'edge' if added == 1 else 'edges'}: new vertices are at the end of the list")
         notes += [
-            describe_crowded(island.vertices[one.result.crowded])
+            "double precision is insufficient next to the fixed "
+            + names_of("vertex", "vertices", island.vertices[one.result.crowded])
             for island, one in zip(islands, mapped.islands, strict=False)
             if one.result.crowded.size
         ]
-        lines = [report.describe_maps(mapped, certified, options.output), *notes]
+        lines = [pipeline.describe_maps(mapped, certified, options.output), *notes]
         return pipeline.Account(facts, lines, certified.injective)
 
     return pipeline.Changed(new, describe)
-
-
-def describe_crowded(vertices: NDArray[np.int64]) -> str:
-    """Return a sentence about vertices where double precision is too coarse for a map."""
-    from quasiharmonic.util.arrays import names_of
-
-    return f"double precision is insufficient next to the fixed {names_of('vertex', 'vertices', vertices)}"
 
 
 def draw(path: Path, certified: WrittenMap, problems: list[Problem], mapped: MappedAtlas, kind: str = "map") -> None:

@@ -17,18 +17,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_options, file, flag, set_default
+from quasiharmonic.ui.cli.arguments import add_options, file, flag, set_default
 
 if TYPE_CHECKING:
     from quasiharmonic.energies.measures import Distortion
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "measure", __doc__, run)
     parser.add_argument(
         "input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map, injective or not"
     )
@@ -51,9 +49,9 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.util.arrays import names_of
 
     set_default(options, "rings", 20, asked=options.distances, belongs="--distances")
-    report.check_new({}, options.json, inputs=(options.input, options.export))
     if options.export is not None:
-        report.check_export(options.export, inputs=(options.input,))
+        io.find_format(options.export, "encode_values")
+    report.check_new({"--export": options.export}, options.json, inputs=(options.input,))
     if finite_elements.has_elements(options.input):
         return finite_elements.measure(options)
     mesh = io.read_mesh(options.input)
@@ -76,9 +74,7 @@ def run(options: argparse.Namespace) -> int:
     if found.distances is not None:
         lines.append(found.distances.summary())
     account = pipeline.Account({"input": str(options.input), **facts}, lines)
-    if options.export is None:
-        return pipeline.conclude(options, account)
-    return pipeline.finish(options, lambda: account, options.export)
+    return pipeline.conclude(options, account, options.export)
 
 
 def _table(found: Distortion, count: int) -> str:

@@ -22,27 +22,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, choice, count, file, flag, number, text
-from quasiharmonic.ui.cli.finite_elements import read_tetrahedra
-from quasiharmonic.ui.cli.group_motions import MOTIONS, in_order, list_motions, move_groups
+from quasiharmonic.ui.cli.arguments import (
+    add_files,
+    add_options,
+    choice,
+    count,
+    file,
+    flag,
+    number,
+    text,
+)
+from quasiharmonic.ui.cli.finite_elements import MOTIONS, in_order, list_motions, move_groups, read_tetrahedra
 from quasiharmonic.util.options import ENERGIES
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
     from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
     from quasiharmonic.io.fem.files import FemMesh
-    from quasiharmonic.ui.cli.arguments import Commands
     from quasiharmonic.util.arrays import FloatArray, IntArray
 
     # Vertices that move, and the function from the share of the motion to their positions
     Moved: TypeAlias = tuple[IntArray, Callable[[float], FloatArray]]
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "morph", __doc__, run)
     add_files(
         parser,
         f"{format_names('read_elements')} file, text or binary",
@@ -106,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
     if options.motions and options.motions[0][0] != "group":
         raise ValueError(f"--{options.motions[0][0]} needs a group: put --group NAME before it")
     inputs = options.input, options.positions, options.rest
-    report.check_moved(options.output, options.json, inputs=inputs)
+    report.check_new({"-o": options.output}, options.json, inputs=inputs)
     check_fem_output(options.output, options.input)
     if options.steps is not None:
         series = dict.fromkeys(map(str, list_series(options.output, options.steps)))
@@ -157,8 +163,8 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
     import numpy as np
 
     from quasiharmonic.apps.tetrahedra.certificate import certify_arrays
+    from quasiharmonic.apps.tetrahedra.elements import inspect_faces
     from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
-    from quasiharmonic.apps.tetrahedra.topology import inspect_faces
     from quasiharmonic.io.fem.files import read_volume, write_fem
     from quasiharmonic.util.arrays import count_of
 
@@ -254,7 +260,7 @@ def _morph(
     if steps > 1 and given["rest"] is None:
         given = given | {"rest": mesh.points}
     results: list[MorphResult | TetrahedraResult] = []
-    with pipeline.working(options.input) as show:
+    with pipeline.show_work(options.input) as show:
         for k in range(1, steps + 1):
             before = results[-1].points if results else mesh.points
             one = morph(

@@ -13,21 +13,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import finite_elements, report, written_map
-from quasiharmonic.ui.cli.arguments import MEASURES, add_command, add_options, choice, set_default, text
+from quasiharmonic.ui.cli import finite_elements, pipeline, report
+from quasiharmonic.ui.cli.arguments import MEASURES, add_options, choice, set_default, text
 from quasiharmonic.ui.cli.pipeline import CHECKERBOARD
 
-if TYPE_CHECKING:
-    from quasiharmonic.ui.cli.arguments import Commands
 
-
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "plot", __doc__, run)
     parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="IMAGE", help="image to write: .png, .svg or .pdf"
@@ -72,5 +67,5 @@ def run(options: argparse.Namespace) -> int:
             texture = io.own_texture(mesh) if options.texture is None else image
             save_texture_figure(options.output, V, F, uv, texture=texture)
         else:
-            save_map_figure(options.output, V, F, uv, inverted=written_map.certify_map(mesh).inverted)
+            save_map_figure(options.output, V, F, uv, inverted=pipeline.certify_map(mesh).inverted)
     return report.tell_written(options.output)

@@ -14,12 +14,11 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, report, seam_options, targets, written_map
+from quasiharmonic.ui.cli import map_options, pipeline
 from quasiharmonic.ui.cli.arguments import (
-    add_command,
     add_files,
     add_options,
-    declared,
+    declare_options,
     file,
     flag,
     pick,
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from quasiharmonic.energies.measures import Distortion
     from quasiharmonic.io import MeshData
     from quasiharmonic.io.seamed_mesh import SeamedMesh
-    from quasiharmonic.ui.cli.arguments import Commands
 
     Lower: TypeAlias = Callable[[SeamedMesh, dict[str, Any]], MappedAtlas]
 
@@ -50,11 +48,10 @@ _MEASURED = {
 }
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "polish", __doc__, run)
     form = format_names("write_map")
     add_files(parser, f"{form} file with an injective map", f"{form} file to write")
     add_options(
@@ -62,7 +59,7 @@ def add_parser(commands: Commands) -> None:
         fixed=file(
             "file of fixed vertices, 0-based, one per line (default: the boundary; with --slide none but the corners)"
         ),
-        **declared(PolishOptions),
+        **declare_options(PolishOptions),
         free=flag("free the boundary; each island stays near its position"),
     )
     add_options(
@@ -80,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("--to gives the outline to slide along: add --slide")
     if options.free and (options.slide or options.fixed is not None):
         raise ValueError("--free frees the boundary: omit --slide and --fixed")
-    targets.check_pieces(options)
+    map_options.check_pieces(options)
     notes: list[str] = []
 
     def lower(mesh: SeamedMesh, given: dict[str, Any]) -> MappedAtlas:
@@ -95,7 +92,7 @@ def run(options: argparse.Namespace) -> int:
             if len(mesh.islands) > 1:
                 raise ValueError(f"--slide --to supports one island, but the mesh has {len(mesh.islands)}")
             slide = find_sliding_curves(options.to, pieces=options.pieces)
-            notes.extend(targets.describe_off_outline(slide, mesh.islands[0]))
+            notes.extend(map_options.describe_off_outline(slide, mesh.islands[0]))
         return atlas.polish(mesh, slide=slide, **given)
 
     return lower_distortion(options, lower, inputs=(options.pieces,), notes=notes)
@@ -109,7 +106,7 @@ def lower_distortion(
     `lower` gets the map, and the options that all of these functions have. ``inputs`` are further files that outputs
     must not replace. ``notes`` are added to the report; `lower` may append to them.
     """
-    seam_options.check_packing(options)
+    map_options.check_packing(options)
 
     def change(mesh: MeshData) -> pipeline.Changed:
         from quasiharmonic import io
@@ -119,11 +116,11 @@ def lower_distortion(
         before = io.mapped(mesh)
         given = pick(options, "energy", "max_iterations", "linear_solver")
         given["fixed"] = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))
-        with pipeline.working(options.input) as show:
+        with pipeline.show_work(options.input) as show:
             after = lower(before, {**given, "callback": show})
 
         def describe(file: MeshData) -> pipeline.Account:
-            written = written_map.certify_map(file)
+            written = pipeline.certify_map(file)
             # Each map is cut at its own seams, which may differ.
             opened = reflect_mirrored(before).opened(), reflect_mirrored(after.mesh).opened()
             measured = [distortion(*io.without_idle(m.V, m.F, m.uv)) for m in opened if m.uv is not None]
@@ -135,7 +132,7 @@ def lower_distortion(
                 "distortion_before": measured[0].to_dict(),
                 "distortion": measured[1].to_dict(),
             }
-            lines = [report.describe_maps(after, written, options.output)]
+            lines = [pipeline.describe_maps(after, written, options.output)]
             if written.injective:
                 lines += [
                     *notes,
@@ -144,7 +141,7 @@ def lower_distortion(
                 ]
             return pipeline.Account(facts, lines, written.injective)
 
-        return pipeline.Changed(mesh.with_places(seam_options.pack_islands(options, after.mesh)), describe)
+        return pipeline.Changed(mesh.with_places(map_options.pack_islands(options, after.mesh)), describe)
 
     return pipeline.change_map(options, change, inputs=(options.fixed, *inputs))
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options
+from quasiharmonic.ui.cli.arguments import add_files, add_options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,12 +26,10 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
     from quasiharmonic.problem import Problem
     from quasiharmonic.solver.refine.refining import RefinedProblem
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
-    parser = add_command(commands, "refine", __doc__, run)
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     add_files(parser, "OBJ file, or a folder with input.obj and handles.txt", "OBJ file to write")
     add_options(parser, "fixed", "json")
 

@@ -15,19 +15,17 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, written_map
-from quasiharmonic.ui.cli.arguments import add_command, add_files, add_options, count, flag, number, pick
+from quasiharmonic.ui.cli import pipeline
+from quasiharmonic.ui.cli.arguments import add_files, add_options, count, flag, number, pick
 
 if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "repair", __doc__, run)
     add_files(
         parser,
         f"{format_names('read', 'seams')} file with texture coordinates",
@@ -63,7 +61,7 @@ def _repair(options: argparse.Namespace, mesh: MeshData) -> pipeline.Changed:
             f"{options.input}: there is no map to repair: no face has texture coordinates (vt) at all three corners"
         )
     given = pick(options, "whole", "unmirror", "max_iterations", "linear_solver")
-    with pipeline.working(options.input) as show:
+    with pipeline.show_work(options.input) as show:
         result = repair(mesh.V, mesh.F, mesh.vt, FT=mesh.FT, callback=show, **given)
     repaired = replace(mesh, vt=result.uv, FT=result.FT)
 
@@ -72,7 +70,7 @@ def _repair(options: argparse.Namespace, mesh: MeshData) -> pipeline.Changed:
         sizes = {"vertices": len(mesh.V), "triangles": len(mesh.F)}
         facts = {**result.to_dict(), "injective": verdict.injective, **sizes}
         account = pipeline.Account(facts, [f"wrote {options.output}: {result.summary()}"], verdict.injective)
-        written_map.add_bent(account.facts, account.closing, repaired)
+        pipeline.add_bent(account.facts, account.closing, repaired)
         return account
 
     return pipeline.Changed(repaired, describe)

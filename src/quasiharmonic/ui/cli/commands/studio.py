@@ -14,20 +14,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli.arguments import add_command
 from quasiharmonic.util.optional import with_extra
 
-if TYPE_CHECKING:
-    from quasiharmonic.ui.cli.arguments import Commands
 
-
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "studio", __doc__, run)
     parser.add_argument(
         "input",
         type=Path,

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import pipeline, report, written_map
-from quasiharmonic.ui.cli.arguments import add_command, add_options, choice, file, set_default
+from quasiharmonic.ui.cli import pipeline, report
+from quasiharmonic.ui.cli.arguments import add_options, choice, file, set_default
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from quasiharmonic.apps.inverse.inverse_map import InverseMap
     from quasiharmonic.apps.inverse.transfer import SurfaceMap
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 _TABLES = ".npy", ".csv", ".txt"
 
@@ -42,11 +41,10 @@ class _MappedFile:
     origin: NDArray[np.int64]  # For each vertex of the cut surface, the vertex of the file; -1 without triangles
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "transfer", __doc__, run)
     for name, text in (("source", "surface that the data belong to"), ("target", "surface that receives them")):
         parser.add_argument(
             name, type=Path, metavar=name.upper(), help=f"{text}: {format_names('write_map')} file with a map"
@@ -129,7 +127,7 @@ def run(options: argparse.Namespace) -> int:
         V[~used] = target.mesh.V[~used]
         with_map = target.mesh.with_places(io.mapped(target.mesh))
         moved = replace(with_map, V=V, normals=b"", FN=None)
-        written_map.tell_losses(options.output, moved)
+        pipeline.tell_losses(options.output, moved)
         io.write_mapped(options.output, moved)
         written.append(str(options.output))
     if values is not None:

@@ -23,14 +23,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import pipeline, written_map
+from quasiharmonic.ui.cli import pipeline
 from quasiharmonic.ui.cli.arguments import (
-    add_command,
     add_files,
     add_options,
     byte_count,
     choice,
-    declared,
+    declare_options,
     degrees,
     file,
     flag,
@@ -44,19 +43,16 @@ from quasiharmonic.ui.cli.arguments import (
 from quasiharmonic.util.options import INSTANCES, BakeOptions, UnwrapOptions
 
 if TYPE_CHECKING:
-    from quasiharmonic.apps.baking.bake import BakeResult
     from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStep
     from quasiharmonic.io import MeshData
-    from quasiharmonic.ui.cli.arguments import Commands
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "unwrap", __doc__, run)
     add_files(parser, f"{format_names('read')} file", f"{format_names('write_map', 'seams')} file to write")
-    own = declared(UnwrapOptions)
+    own = declare_options(UnwrapOptions)
     add_options(
         parser,
         **own,
@@ -170,10 +166,10 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
 
     for k in range(options.channel):
         io.select_channel(mesh, k)  # raises an error before the work if the file does not have this one
-    given = pick(options, "resolution", "stack", "weld", *declared(UnwrapOptions))
+    given = pick(options, "resolution", "stack", "weld", *declare_options(UnwrapOptions))
     if options.symmetry == "none":
         given["symmetry"] = None
-    with pipeline.working(options.input, _words) as show:
+    with pipeline.show_work(options.input, _words) as show:
         result = unwrap(
             mesh.V,
             mesh.F,
@@ -196,8 +192,12 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         )
     unwrapped, divided = add_map(mesh, result)
     unwrapped = io.place_map(unwrapped, mesh, options.channel)
-    baked = _bake(options, mesh, unwrapped)
-    unwrapped = unwrapped if baked is None else baked.mesh
+    baked = None
+    if options.bake:
+        from quasiharmonic.apps.baking.bake import bake
+
+        baked = bake(mesh, unwrapped, size=options.resolution)
+        unwrapped = baked.mesh
 
     def describe(written: MeshData) -> pipeline.Account:
         same = is_written(written, result)
@@ -221,7 +221,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         if divided:
             lines.append(f"{count_of('polygon', 'polygons', divided)} written as triangles, because seams cross them")
         account = pipeline.Account(facts, lines, done)
-        written_map.add_bent(account.facts, account.closing, unwrapped)
+        pipeline.add_bent(account.facts, account.closing, unwrapped)
         if not same:
             account.closing.append(f"{options.output} has other coordinates than were certified")
         return account
@@ -242,15 +242,6 @@ def _check_bake(options: argparse.Namespace) -> None:
         raise ValueError("--bake makes one texture: omit --tiles and --tile-by")
     BakeOptions(size=options.resolution)
     pipeline.check_image_output(options)
-
-
-def _bake(options: argparse.Namespace, mesh: MeshData, unwrapped: MeshData) -> BakeResult | None:
-    """Bake the look of the mesh for its new texture coordinates, if ``--bake`` is given."""
-    if not options.bake:
-        return None
-    from quasiharmonic.apps.baking.bake import bake
-
-    return bake(mesh, unwrapped, size=options.resolution)
 
 
 def _words(step: UnwrapStep) -> str:

@@ -13,20 +13,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import report
-from quasiharmonic.ui.cli.arguments import add_command, add_options, file
-
-if TYPE_CHECKING:
-    from quasiharmonic.ui.cli.arguments import Commands
+from quasiharmonic.ui.cli.arguments import add_options, file
 
 
-def add_parser(commands: Commands) -> None:
-    """Declare the command."""
+def declare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser = add_command(commands, "view", __doc__, run)
     parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
     shot = file("write the view to this file instead of opening a window; needs no display", metavar="PNG")
     add_options(parser, "surface", screenshot=shot)

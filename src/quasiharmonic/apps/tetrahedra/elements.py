@@ -1,7 +1,7 @@
-"""Exact orientation of tetrahedra, and of the tetrahedra at the corners of hexahedra.
+"""Elements of tetrahedral meshes: the exact orientation of tetrahedra and hexahedra, faces, and defects of the mesh.
 
-The predicate has four stages, like `quasiharmonic.geometry.exact.predicates`. Each stage processes the tetrahedra that
-the previous one could not decide:
+The predicate of orientation has four stages, like `quasiharmonic.geometry.exact.predicates`. Each stage processes the
+tetrahedra that the previous one could not decide:
 
 1. the determinant in floating point with an error bound [1]_, after scaling the mesh by a power of two;
 2. the same after scaling each tetrahedron separately;
@@ -17,12 +17,13 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.predicates import ROUNDS_ONCE, exact_sum, two_product, two_sum
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, repeat_each
 from quasiharmonic.util.progress import heartbeat
 
 SignArray = NDArray[np.int8]
@@ -39,6 +40,13 @@ _CHUNK = 1 << 14
 _CORNERS = np.array(
     [(0, 1, 3, 4), (1, 2, 0, 5), (2, 3, 1, 6), (3, 0, 2, 7), (4, 7, 5, 0), (5, 4, 6, 1), (6, 5, 7, 2), (7, 6, 4, 3)]
 )
+#: Faces of a positive tetrahedron, counterclockwise seen from outside; face k is opposite vertex k.
+FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
+#: Edges of a tetrahedron.
+EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+_EDGES_OF_TRIANGLE = np.array([(0, 1), (1, 2), (2, 0)])
+# Vertex counts up to this have three vertices in one integer.
+_MAX_PACKED = 1 << 21
 
 
 class ExactSigns:
@@ -65,7 +73,9 @@ class ExactSigns:
                 sign[block] = _sign_if_certain(self._edges(corners[block].T))
             undecided = np.flatnonzero(sign == 0)
             if not self.finite.all():
-                undecided = undecided[np.asarray(self.finite[corners[undecided]].all(axis=1))]
+                finite = np.asarray(self.finite[corners].all(axis=1))
+                sign[~finite] = 0
+                undecided = undecided[finite[undecided]]
             for start in range(0, undecided.size, _CHUNK):
                 heartbeat()
                 chunk = undecided[start : start + _CHUNK]
@@ -81,12 +91,7 @@ class ExactSigns:
 def tetrahedron_signs(T: IntArray, X: FloatArray) -> tuple[SignArray, IntArray]:
     """Exact orientations (t,) int8 of tetrahedra, and the ascending indices of those with a non-finite coordinate."""
     signs = ExactSigns(X)
-    sign = signs(T)
-    nonfinite = np.empty(0, dtype=np.int64)
-    if not signs.finite.all():
-        nonfinite = np.flatnonzero(~np.asarray(signs.finite[T].all(axis=1)))
-        sign[nonfinite] = 0
-    return sign, nonfinite
+    return signs(T), np.flatnonzero(~signs.finite[T].all(axis=1))
 
 
 def _sign_if_certain(edges: Sequence[FloatArray]) -> SignArray:
@@ -161,3 +166,99 @@ def find_bad_corners(H: IntArray, X: FloatArray) -> IntArray:
     """
     sign, _ = tetrahedron_signs(H[:, _CORNERS].reshape(-1, 4), X)
     return np.flatnonzero((sign.reshape(-1, 8) <= 0).any(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class FaceReport:
+    """The faces of a tetrahedral mesh.
+
+    Attributes
+    ----------
+    boundary : (b, 3) int64
+        Triangles in one tetrahedron only, counterclockwise seen from outside if the tetrahedron is positive.
+    nonmanifold : (k, 3) int64
+        Faces of three or more tetrahedra.
+    inconsistent : (k, 3) int64
+        Faces of two tetrahedra that traverse them in the same direction.
+    repeated : (k,) int64
+        Tetrahedra with the same four vertices as an earlier one, and those with a vertex twice.
+    """
+
+    boundary: IntArray
+    nonmanifold: IntArray
+    inconsistent: IntArray
+    repeated: IntArray
+
+
+def inspect_faces(T: IntArray, n: int) -> FaceReport:
+    """Find the boundary and the defects of tetrahedra (t, 4) among ``n`` vertices."""
+    faces = T[:, FACES].reshape(-1, 3)
+    ordered, odd = _sort_triples(faces)
+    order, first = _group(ordered, n)
+    size = np.diff(np.append(first, len(order)))
+    alone = np.sort(order[first[size == 1]])
+    pair = first[size == 2]
+    one, other = order[pair], order[pair + 1]
+    opposite = T.ravel()  # face k of a tetrahedron is opposite its vertex k
+    twins = opposite[one] == opposite[other]
+    twice = np.flatnonzero((np.sort(T, axis=1)[:, 1:] == np.sort(T, axis=1)[:, :-1]).any(axis=1))
+    crowded = np.unique(order[repeat_each(size > 2, size)] // 4)
+    repeated = [np.maximum(one, other)[twins] // 4, twice]
+    if crowded.size:
+        keys = np.sort(T[crowded], axis=1)
+        _, index, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        repeated.append(crowded[index[number.ravel()] != np.arange(len(crowded))])
+    return FaceReport(
+        boundary=faces[alone],
+        nonmanifold=ordered[order[first[size > 2]]],
+        inconsistent=ordered[one[odd[one] == odd[other]]],
+        repeated=np.unique(np.concatenate(repeated)),
+    )
+
+
+def _sort_triples(faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Sort the vertices of every face; also return whether the permutation is odd."""
+    a, b, c = faces.T
+    odd = (a > b).astype(np.int64) + (a > c) + (b > c)
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    return np.stack([low, a + b + c - low - high, high], axis=1), odd & 1
+
+
+def _group(rows: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Return an order in which equal rows of vertices are adjacent, and the start of each group of equal rows."""
+    if not len(rows):
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    if n <= _MAX_PACKED:
+        key = rows[:, 0]
+        for column in rows.T[1:]:
+            key = key * n + column
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        differs = key[1:] != key[:-1]
+    else:
+        order = np.lexsort(rows.T[::-1])
+        rows = rows[order]
+        differs = (rows[1:] != rows[:-1]).any(axis=1)
+    return order, np.flatnonzero(np.concatenate([[True], differs]))
+
+
+def find_patches(boundary: IntArray) -> IntArray:
+    """Number the parts (b,) of a boundary (b, 3) that are connected across edges of exactly two of its triangles."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.sort(boundary[:, _EDGES_OF_TRIANGLE].reshape(-1, 2), axis=1)
+    order, first = _group(edges, int(boundary.max(initial=0)) + 1)
+    pair = first[np.diff(np.append(first, len(order))) == 2]
+    one, other = order[pair] // 3, order[pair + 1] // 3
+    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(len(boundary), len(boundary)))
+    labels: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)
+    return labels
+
+
+def find_mesh_edges(T: IntArray) -> IntArray:
+    """Return the edges (e, 2) of tetrahedra, each once, lower vertex first."""
+    pairs = np.sort(T[:, EDGES].reshape(-1, 2), axis=1)
+    n = int(T.max(initial=0)) + 1
+    key = np.unique(pairs[:, 0] * n + pairs[:, 1])
+    return np.stack(np.divmod(key, n), axis=1)

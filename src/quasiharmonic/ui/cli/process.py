@@ -1,26 +1,34 @@
-"""Write to standard output and standard error, also after their readers have closed them.
+"""The process of a command: standard output, standard error, and the signals that end it.
 
-Progress is shown on one terminal line that is overwritten, or in a log.
+The streams can be closed by their readers. Progress is shown on one terminal line that is overwritten, or in a log.
+SIGTERM and SIGHUP act like Ctrl-C, because schedulers and terminals end commands with them. Python raises
+`KeyboardInterrupt` at any point of the main thread. In a finaliser Python reports it and drops it. During the
+initialisation of an extension module it can turn into another exception.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
     from quasiharmonic.problem.result import Step
 
 #: Exit status of a process that wrote to a pipe without a reader: 128 plus the number of SIGPIPE.
 NO_READER = 141
 #: Seconds between two lines of progress where standard error is not a terminal.
 LOG = 10.0
-_INTERVAL = 0.1
+_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 def tell(text: str) -> None:
@@ -83,7 +91,7 @@ def overwrite(text: str) -> None:
 
 @contextmanager
 def progress_line(
-    words: Callable[[Any], str] = describe_step, *, live: float = _INTERVAL
+    words: Callable[[Any], str] = describe_step, *, live: float = 0.1
 ) -> Iterator[Callable[[Any], None] | None]:
     """Yield a callback that shows steps every ``live`` seconds.
 
@@ -109,3 +117,59 @@ def progress_line(
     finally:
         if terminal:
             overwrite("")
+
+
+class Interrupts:
+    """Context manager that records interrupts and repeats those that Python lost.
+
+    It does nothing about a signal that has another handler or is ignored, and nothing outside the main thread.
+
+    Attributes
+    ----------
+    happened : bool
+        Whether an interrupt occurred.
+    """
+
+    def __init__(self) -> None:
+        self.happened = False
+        self._before: dict[int, Any] = {}
+        self._last: int = signal.SIGINT
+
+    def __enter__(self) -> Self:
+        mine = threading.current_thread() is threading.main_thread()
+        handlers = {number: signal.getsignal(number) for number in _SIGNALS} if mine else {}
+        usual = signal.default_int_handler, signal.SIG_DFL
+        self._before = {number: handler for number, handler in handlers.items() if handler in usual}
+        if self._before:
+            self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
+        for number in self._before:
+            signal.signal(number, self._interrupt)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if self._before:
+            sys.unraisablehook = self._hook
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        self.happened, self._last = True, number
+        raise KeyboardInterrupt
+
+    def _unraisable(self, lost: UnraisableHookArgs) -> None:
+        if isinstance(lost.exc_value, KeyboardInterrupt):
+            again = threading.Timer(0.01, _interrupt_main, [self._last])
+            again.daemon = True
+            again.start()
+        else:
+            self._hook(lost)
+
+
+def _interrupt_main(number: int) -> None:
+    """Interrupt the main thread by a signal, also while it waits."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:  # Windows, where `_thread.interrupt_main` does not wake a thread that sleeps
+        signal.raise_signal(number)
