@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
 from quasiharmonic.apps.flattening.multilevel.hierarchy import LOWEST, Hierarchy, Level
+from quasiharmonic.apps.flattening.patches import descend_on_patches
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
@@ -38,13 +39,8 @@ _SWEEPS = 4
 _MIN_WEIGHT = 0.02
 # A triangle is bad if its density is this factor times the 75 % quantile.
 _BAD = 20.0
-# Rings of triangles around bad triangles that belong to a patch.
-_RINGS = 2
-# If patches cover more than this fraction of the mesh, only triangles beyond this quantile of the density are bad.
-_MAX_SHARE = 0.4
+# If their patches are too large, only triangles beyond this quantile of the density are bad.
 _WORST = 0.99
-_MAX_STEPS = 20
-_MOVE_TOLERANCE = 1e-2
 #: Number of vertices of the coarsest mesh.
 COARSEST = 150
 #: Minimum ratio between the vertex counts of successive meshes.
@@ -69,7 +65,7 @@ def smooth_map(
     with np.errstate(all="ignore"):
         better = energy.value(after) < energy.value(before)
     start = (after if better else before).view(np.float64).reshape(-1, 2)
-    opened = _descend_on_patches(V, F, start, energy, linear_solver)
+    opened = _descend_on_patches(start, energy, linear_solver)
     return _undo_overlaps(F, Rim(loops), start, opened)
 
 
@@ -124,31 +120,15 @@ def _undo_overlaps(F: IntArray, rim: Rim, start: FloatArray, opened: FloatArray)
     return start if rim.meets_itself(opened) else opened
 
 
-def _descend_on_patches(
-    V: FloatArray, F: IntArray, uv: FloatArray, energy: DeformationEnergy, linear_solver: str
-) -> FloatArray:
+def _descend_on_patches(uv: FloatArray, energy: DeformationEnergy, linear_solver: str) -> FloatArray:
     """Descend on patches around the worst triangles, with all other vertices fixed; the boundary may overlap itself."""
     with np.errstate(all="ignore"):
         density = energy.energy.density(energy.deform(in_units(uv, 0)))
     for bad in _BAD * np.quantile(density, 0.75), np.quantile(density, _WORST):
-        loose = mark(len(V), F[density > bad])
-        for _ in range(_RINGS):
-            loose[F[has_marked_corner(F, loose)]] = True
-        patches = F[has_marked_corner(F, loose)]
-        if len(patches) < _MAX_SHARE * len(F):
-            break
-    if not 0 < len(patches) < _MAX_SHARE * len(F):
-        return uv
-    vertices, flat = np.unique(patches, return_inverse=True)
-    patches = flat.reshape(-1, 3)
-    descent = SurfaceDescent(
-        thick_energy(V[vertices], patches), uv[vertices], linear_solver, np.flatnonzero(~loose[vertices])
-    )
-    for _ in islice(descend(descent, SymmetricDirichlet(), _MOVE_TOLERANCE), _MAX_STEPS):
-        pass
-    opened = uv.copy()
-    opened[vertices] = descent.uv
-    return opened
+        moved = descend_on_patches(energy, SymmetricDirichlet(), uv, density > bad, linear_solver)
+        if moved is not None:
+            return moved
+    return uv
 
 
 def flatten_coarse(
