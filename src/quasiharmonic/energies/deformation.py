@@ -107,6 +107,17 @@ class DeformationEnergy:
         other._det_per_area = self._det_per_area / det
         return other
 
+    def restrict(self, triangles: IntArray, F: IntArray, energy: Energy) -> DeformationEnergy:
+        """Return the energy of some triangles (k,) with other vertex numbers ``F`` (k, 3) and another density.
+
+        Their weights do not change, so values of both energies with the same density differ by the other triangles.
+        """
+        part = copy(self)
+        part.energy, part.F, part._vertex_count = energy, own_triangles(F), int(F.max(initial=-1)) + 1
+        part.g, part.share = np.ascontiguousarray(self.g[:, triangles]), self.share[triangles]
+        part._det_per_area = self._det_per_area[triangles]
+        return part
+
     def deform(self, w: ComplexArray) -> Deformation:
         """Jacobian of a map ``w = u + i v`` (n,) complex128 on every triangle.
 

@@ -27,7 +27,6 @@ References
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -45,10 +44,13 @@ from quasiharmonic.util.progress import heartbeat
 if TYPE_CHECKING:
     from scipy.sparse import dia_array
 
-# The barrier's width d.
+# The penalty's width d.
 _WIDTH = 0.05
-# The barrier's weights κ in turn.
-_WEIGHTS = 1e-3, 1e-5
+# The barrier's weights κ, its widths d and the maximum numbers of steps, in turn; then those if a patch has more than
+# _LARGE pixels. Steps of a patch with many folds to a thin barrier are short.
+_BARRIERS = (1e-3, _WIDTH, 100), (1e-5, _WIDTH, 100)
+_WIDE_BARRIERS = (1e-1, 0.5, 20), (1e-2, 0.2, 20), (1e-3, _WIDTH, 40), (1e-5, _WIDTH, 40)
+_LARGE = 5_000
 # The penalty's weights in turn.
 _PENALTIES = 1e-2, 1e-1, 1.0, 10.0, 100.0
 # A patch has converged if Newton's model predicts a decrease below this fraction of its value.
@@ -57,8 +59,7 @@ _TOLERANCE = 1e-6
 _ZERO_DECREASE = 1e-14
 # It has also converged if a step lowers its value by less than this fraction.
 _IDLE = 1e-9
-# Maximum number of steps for one weight of the barrier, and of the penalty.
-_MAX_STEPS = 100
+# Maximum number of steps for one weight of the penalty.
 _MAX_PENALTY_STEPS = 10
 # Maximum number of lengths of one step.
 _MAX_HALVINGS = 30
@@ -140,7 +141,9 @@ def descend_patches(
     ``min_jacobian`` at all corners of cells with free pixels. ``given`` (h, w) is the given map, and ``patch`` (h, w)
     the patch of each free pixel, from 1 on; 0 for fixed pixels.
     """
-    _descend_batches(_Patches(grid, w, given, patch, ThinBarrier(min_jacobian, _WIDTH)), _WEIGHTS, _MAX_STEPS)
+    large = np.bincount(patch.ravel())[1:].max(initial=0) > _LARGE
+    for weight, width, steps in _WIDE_BARRIERS if large else _BARRIERS:
+        _descend_batches(_Patches(grid, w, given, patch, ThinBarrier(min_jacobian, width)), weight, steps)
 
 
 class _Patches(NamedTuple):
@@ -153,17 +156,15 @@ class _Patches(NamedTuple):
     energy: _OfDeterminant
 
 
-def _descend_batches(patches: _Patches, weights: Iterable[float], steps: int) -> None:
-    """Converge all patches for some weights in turn, with at most so many steps each."""
+def _descend_batches(patches: _Patches, weight: float, steps: int) -> None:
+    """Converge all patches for one weight of the energy, with at most so many steps."""
     size = np.bincount(patches.patch.ravel())
     size[0] = 0
     batch = (np.cumsum(size) - size) // _AT_ONCE
     # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never taken.
     with np.errstate(all="ignore"):
         for number in range(int(batch[-1]) + 1):
-            todo = np.flatnonzero((batch == number) & (size > 0))
-            for weight in weights:
-                _descend(patches, todo, weight, steps)
+            _descend(patches, np.flatnonzero((batch == number) & (size > 0)), weight, steps)
 
 
 def _descend(patches: _Patches, todo: IntArray, weight: float, steps: int) -> None:
@@ -291,7 +292,7 @@ def fill_patches(
             patch = label_patches(free)
             folded = np.isin(patch, np.unique(patch[find_points(wrong)]))
             patches = _Patches(grid, w, given, np.where(folded, patch, 0), FoldPenalty(min_jacobian, _WIDTH))
-            _descend_batches(patches, [weight], _MAX_PENALTY_STEPS)
+            _descend_batches(patches, weight, _MAX_PENALTY_STEPS)
             free |= grow_pressing(w != given, patch, fixed)
             wrong = find_folds(grid, w, min_jacobian)
             if not wrong.any():

@@ -16,6 +16,7 @@ from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
 from quasiharmonic.apps.flattening.layout import to_given_unit
 from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.apps.flattening.patches import PatchDescents
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Energy
@@ -326,7 +327,7 @@ class Flattening:
         """Descend from a map, which must be bijective if ``guarded``; return None if the result overlaps itself."""
         options, solver = self._options, self._options.linear_solver
         energy = self._piece.energy(self._density if near else ReweightedDirichlet(), self._weights)
-        descent = SurfaceDescent(energy, uv, solver, rim=self._rim if guarded else None)
+        descent = SurfaceDescent(energy, uv, solver, rim=self._rim if guarded else None, iterate=True)
         self._solver = descent.linear_solver
         apart, status = guarded, Status.STILL_FALLING
         recent: deque[tuple[float, FloatArray]] = deque(maxlen=_RECENT)
@@ -335,7 +336,8 @@ class Flattening:
             return self._measure.value(descent.w)
 
         def take_steps() -> Iterator[Status | None]:
-            course = descend(descent, self._density, options.tol)
+            patches = None if guarded else PatchDescents(self._measure, solver).improve
+            course = descend(descent, self._density, options.tol, patches)
             for number, outcome in enumerate(itertools.islice(course, options.max_iterations), 1):
                 recent.append((measure(), descent.uv))
                 yield outcome

@@ -5,7 +5,7 @@ One vertex is fixed to prevent drift. Rotation remains possible; a raised diagon
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -15,9 +15,10 @@ import numpy as np
 from quasiharmonic.apps.flattening.contacts import HATS, Rim, RimContacts
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Energy, QuadraticForm
+from quasiharmonic.energies.newton.iterated_descent import IteratedDescent
 from quasiharmonic.energies.newton.line_search import backtrack, extend
 from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, NewtonObjective, in_units
-from quasiharmonic.energies.newton.newton_descent import NewtonDescent, NewtonState
+from quasiharmonic.energies.newton.newton_descent import NewtonState
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.energies.newton.rotation_path import RotationPath, rates
@@ -43,8 +44,8 @@ _SLOW_STEPS = 4
 # Minimum ratio of median rotation to median growth of such triangles. Below it a straight step is as good, and needs no
 # solve.
 _TURNED = 12.0
-# Below this mean energy Newton steps converge faster than those of `ReweightedDirichlet`.
-_NEAR_ENERGY = 0.1
+#: Below this mean energy Newton steps converge faster than those of `ReweightedDirichlet`.
+NEAR_ENERGY = 0.1
 
 
 class _Evaluation(NamedTuple):
@@ -287,11 +288,12 @@ class GuardedModel(SurfaceModel):
         return value, there._replace(extra=there.extra._replace(near=near, gap=gap))
 
 
-class SurfaceDescent(NewtonDescent):
+class SurfaceDescent(IteratedDescent):
     """Newton steps of a map with a free boundary, from an injective map ``uv`` (n, 2) of about unit size.
 
     ``fixed`` has at least one vertex, to prevent drift; usually exactly one. With the surface's boundary as ``rim`` the
-    map stays bijective. ``pairs`` are further second derivatives of the energy.
+    map stays bijective. ``pairs`` are further second derivatives of the energy. Without rim and pairs,
+    ``iterate`` is that of `IteratedDescent`.
     """
 
     model: SurfaceModel
@@ -305,10 +307,11 @@ class SurfaceDescent(NewtonDescent):
         *,
         rim: Rim | None = None,
         pairs: Pairs | None = None,
+        iterate: bool = False,
     ) -> None:
         options = uv, linear_solver, np.asarray(fixed, dtype=np.int64), pairs
         model = SurfaceModel(energy, *options) if rim is None else GuardedModel(energy, *options, rim)
-        super().__init__(model, model.start(uv))
+        super().__init__(model, model.start(uv), iterate=iterate and rim is None and pairs is None)
 
     @property
     def uv(self) -> FloatArray:
@@ -324,6 +327,11 @@ class SurfaceDescent(NewtonDescent):
     def linear_solver(self) -> str:
         """Name of the linear solver."""
         return self.model.system.solver.name
+
+    def move_to(self, uv: FloatArray) -> None:
+        """Continue from another map (n, 2) without contacts."""
+        self.model.coordinates = Coordinates.of(uv, self.model.coordinates.fixed, 0)
+        self.state = self.model.start(uv)
 
     def use_density(self, density: Energy) -> None:
         """Continue with another density on the same triangles; the energy must be a `DeformationEnergy`."""
@@ -347,25 +355,36 @@ def _unite_pairs(older: IntArray, newer: IntArray, n: int) -> IntArray:
     return newer if first.size > 2 * newer.shape[1] else both[:, first]
 
 
-def descend(descent: SurfaceDescent, density: Energy, tol: float) -> Iterator[Status | None]:
+def descend(
+    descent: SurfaceDescent,
+    density: Energy,
+    tol: float,
+    improve: Callable[[FloatArray], FloatArray | None] | None = None,
+) -> Iterator[Status | None]:
     """Take steps until converged or stalled; yield None after every step but the last, which yields a status.
 
     If the density of the descent, at its start, is `ReweightedDirichlet`, it is used until the mean energy is small, as
     long as two steps together at least halve it. ``density`` is the one to minimise, and ``tol`` is that of
-    `quasiharmonic.polish`.
+    `quasiharmonic.polish`. ``improve`` is called before each step. It takes the map and returns a better one or None.
     """
     values = [np.inf, descent.distortion]
     surface = descent.model.surface
     far = isinstance(surface, DeformationEnergy) and isinstance(surface.energy, ReweightedDirichlet)
     area = float(surface.share.sum()) if isinstance(surface, DeformationEnergy) else 1.0
     while True:
+        better = None if improve is None else improve(descent.uv)
+        if better is not None:
+            descent.move_to(better)
+            if far and descent.distortion < NEAR_ENERGY * area:
+                far = False
+                descent.use_density(density)
         if far:
             assert isinstance(surface, DeformationEnergy)
             surface.energy = ReweightedDirichlet.at(descent.distortion / area)
         with np.errstate(all="ignore"):
             outcome = descent.step(tol)
         values.append(descent.distortion)
-        near = values[-1] < _NEAR_ENERGY * area
+        near = values[-1] < NEAR_ENERGY * area
         if far and (outcome is not None or near or not values[-1] < 0.5 * values[-3]):
             far, outcome = False, None
             descent.use_density(density)

@@ -10,12 +10,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import descend_around, flatten_coarse, grow_rings
+from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.apps.flattening.patches import descend_on_patches
 from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
@@ -25,7 +25,7 @@ from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.options import FlattenOptions
 
 #: No triangle may be stretched more than this, except triangles with a smaller angle than `THIN_ANGLE`.
@@ -245,10 +245,10 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
 def _relax_long(chart: WorkingChart, bound: float) -> None:
     """Lower the stretch around triangles that are stretched too much, with the rest of the map fixed."""
     assert chart.uv is not None
-    loose = grow_rings(chart.F, mark(len(chart.V), chart.F[chart.too_long]))
     density = EvenStretch(bound)
-    energy = partial(DeformationEnergy, energy=density)
-    chart.use(descend_around(energy, density, chart.piece.V, chart.F, chart.uv, loose))
+    moved = descend_on_patches(chart.piece.energy(density, None), density, chart.uv, chart.too_long, "auto")
+    if moved is not None:
+        chart.use(moved)
 
 
 def _fit_scale(piece: Piece, uv: FloatArray) -> FloatArray:

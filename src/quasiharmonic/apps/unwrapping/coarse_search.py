@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import grow_rings
+from quasiharmonic.apps.flattening.patches import mark_around
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
 from quasiharmonic.energies.energies import SymmetricDirichlet
@@ -160,7 +160,7 @@ def _repair(chart: WorkingChart, uv: FloatArray, inverted: BoolArray) -> FloatAr
     if np.count_nonzero(inverted) > _FEW * len(chart.F):
         return None
     n = len(uv)
-    loose = grow_rings(chart.F, mark(n, chart.F[inverted])) & ~mark(n, *chart.piece.loops)
+    loose = mark_around(chart.F, inverted, n) & ~mark(n, *chart.piece.loops)
     rows = np.flatnonzero(has_marked_corner(chart.F, loose))
     if not rows.size:
         return None

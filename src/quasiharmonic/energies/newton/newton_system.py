@@ -173,6 +173,32 @@ class NewtonSystem:
                 return direction, expected_decrease, number
         return None
 
+    def iterate(
+        self, load: ComplexArray, precondition: Callable[[ComplexArray], ComplexArray], steps: int, residual: float
+    ) -> tuple[ComplexArray, bool]:
+        """Solve with the assembled matrix by at most ``steps`` preconditioned conjugate gradients.
+
+        Return the displacements (n - k,) complex128, and whether the work that the remaining load could do is at most
+        ``residual`` times theirs.
+        """
+        from scipy.sparse import csr_array
+
+        upper = csr_array((self._values, self._indices, self._indptr), shape=2 * (self._first.size,))
+        lower, x, rest = upper.T, np.zeros(load.size, dtype=np.complex128), load.copy()
+        along, before, done = np.zeros_like(x), 1.0, 0.0
+        for _ in range(steps):
+            heartbeat()
+            better = precondition(rest)
+            gain = work(rest, better)
+            if gain <= residual * done:
+                return x, True
+            along = better + gain / before * along
+            flat = along.view(np.float64)
+            image = (upper @ flat + lower @ flat - self.diagonal * flat).view(np.complex128)
+            length = gain / work(along, image)
+            x, rest, before, done = x + length * along, rest - length * image, gain, done + length * gain
+        return x, False
+
     def solve_diagonal(self, load: ComplexArray) -> ComplexArray:
         """Divide the load by the matrix's diagonal, as a fallback if no factorisation exists."""
         diagonal = np.where(self.diagonal > 0, self.diagonal, 1)

@@ -10,7 +10,7 @@ around them are cheap.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
@@ -20,16 +20,17 @@ from scipy.sparse.csgraph import connected_components
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
 from quasiharmonic.apps.flattening.multilevel.hierarchy import LOWEST, Hierarchy, Level
+from quasiharmonic.apps.flattening.patches import descend_on_patches
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
-from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
+from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.geometry.coarsening.levels import has_marked_corner
 from quasiharmonic.geometry.coarsening.prolongation import are_positive
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.reference import rest_frames, rest_shapes
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, to_points
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, to_points
 
 # Fraction of the way to the weighted mean of its neighbours that a vertex moves.
 _STEP = 0.8
@@ -38,13 +39,8 @@ _SWEEPS = 4
 _MIN_WEIGHT = 0.02
 # A triangle is bad if its density is this factor times the 75 % quantile.
 _BAD = 20.0
-# Rings of triangles around bad triangles that belong to a patch.
-_RINGS = 2
-# If patches cover more than this fraction of the mesh, only triangles beyond this quantile of the density are bad.
-_MAX_SHARE = 0.4
+# If their patches are too large, only triangles beyond this quantile of the density are bad.
 _WORST = 0.99
-_MAX_STEPS = 20
-_MOVE_TOLERANCE = 1e-2
 #: Number of vertices of the coarsest mesh.
 COARSEST = 150
 #: Minimum ratio between the vertex counts of successive meshes.
@@ -69,7 +65,7 @@ def smooth_map(
     with np.errstate(all="ignore"):
         better = energy.value(after) < energy.value(before)
     start = (after if better else before).view(np.float64).reshape(-1, 2)
-    opened = _descend_on_patches(V, F, start, energy, linear_solver)
+    opened = _descend_on_patches(start, energy, linear_solver)
     return _undo_overlaps(F, Rim(loops), start, opened)
 
 
@@ -124,52 +120,15 @@ def _undo_overlaps(F: IntArray, rim: Rim, start: FloatArray, opened: FloatArray)
     return start if rim.meets_itself(opened) else opened
 
 
-def _descend_on_patches(
-    V: FloatArray, F: IntArray, uv: FloatArray, energy: DeformationEnergy, linear_solver: str
-) -> FloatArray:
+def _descend_on_patches(uv: FloatArray, energy: DeformationEnergy, linear_solver: str) -> FloatArray:
     """Descend on patches around the worst triangles, with all other vertices fixed; the boundary may overlap itself."""
     with np.errstate(all="ignore"):
         density = energy.energy.density(energy.deform(in_units(uv, 0)))
     for bad in _BAD * np.quantile(density, 0.75), np.quantile(density, _WORST):
-        loose = grow_rings(F, mark(len(V), F[density > bad]))
-        count = np.count_nonzero(has_marked_corner(F, loose))
-        if count < _MAX_SHARE * len(F):
-            break
-    if not 0 < count < _MAX_SHARE * len(F):
-        return uv
-    return descend_around(thick_energy, SymmetricDirichlet(), V, F, uv, loose, linear_solver)
-
-
-def descend_around(
-    energy: Callable[[FloatArray, IntArray], DeformationEnergy],
-    density: Energy,
-    V: FloatArray,
-    F: IntArray,
-    uv: FloatArray,
-    loose: BoolArray,
-    linear_solver: str = "auto",
-) -> FloatArray:
-    """Descend on the triangles at some vertices (n,), with all others fixed; the boundary may overlap itself.
-
-    ``energy`` makes the energy of a mesh, and ``density`` is as for `descend`. Return the map (n, 2).
-    """
-    patches = F[has_marked_corner(F, loose)]
-    vertices, flat = np.unique(patches, return_inverse=True)
-    T = flat.reshape(-1, 3)
-    descent = SurfaceDescent(energy(V[vertices], T), uv[vertices], linear_solver, np.flatnonzero(~loose[vertices]))
-    for _ in islice(descend(descent, density, _MOVE_TOLERANCE), _MAX_STEPS):
-        pass
-    opened = uv.copy()
-    opened[vertices] = descent.uv
-    return opened
-
-
-def grow_rings(F: IntArray, marked: BoolArray, rings: int = _RINGS) -> BoolArray:
-    """Return a mask (n,) of some vertices and those up to some rings of triangles around them."""
-    loose = marked.copy()
-    for _ in range(rings):
-        loose[F[has_marked_corner(F, loose)]] = True
-    return loose
+        moved = descend_on_patches(energy, SymmetricDirichlet(), uv, density > bad, linear_solver)
+        if moved is not None:
+            return moved
+    return uv
 
 
 def flatten_coarse(
