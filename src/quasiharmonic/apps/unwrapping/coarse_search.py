@@ -29,7 +29,6 @@ from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.solver.mapping import injective_map
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at, to_complex, to_points
 
@@ -155,6 +154,9 @@ def _direction(p: ComplexArray) -> ComplexArray:
 
 def _repair(chart: WorkingChart, uv: FloatArray, inverted: BoolArray) -> FloatArray | None:
     """Map the surroundings of inverted triangles (f,) anew, with all other vertices fixed; None if that fails."""
+    # Few surfaces need this, and it imports the whole solver.
+    from quasiharmonic.solver.mapping import injective_map
+
     if is_injective(chart.F, uv):
         return uv
     if np.count_nonzero(inverted) > _FEW * len(chart.F):
