@@ -7,7 +7,6 @@ from typing import Any
 
 import bpy
 import numpy as np
-from quasiharmonic.apps.repair.fitting import fit_boundary
 
 from quasiharmonic import atlas, repair
 from quasiharmonic.apps.atlas import seam_cuts
@@ -20,6 +19,7 @@ from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.results import Step
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.targets.boundary.corner_pins import CornerSpec
+from quasiharmonic.targets.boundary.fitting import fit_boundary
 from quasiharmonic.util.arrays import IntArray, count_of
 from quasiharmonic.util.options import ENERGY_LABELS, PolishOptions
 
