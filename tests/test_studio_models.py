@@ -228,3 +228,15 @@ def test_triangles_without_texture_coordinates_are_added_to_those_with(tmp_path,
     saved = state.sheet.mapped_file(state.mesh)
     assert np.array_equal(saved.corner_uv[len(F) : len(F) + len(G)], mesh.corner_uv[len(F) : len(F) + len(G)])
     assert saved.corner_uv[: len(F), :, 0].min() >= 2
+
+
+def test_a_map_is_kept_if_only_a_repeated_triangle_has_no_coordinates(tmp_path):
+    V, F = grid(5, 5)
+    mesh = io.MeshData(
+        np.pad(V, [(0, 0), (0, 1)]), np.vstack([F, F[:1]]), vt=0.3 * V, FT=np.vstack([F, -np.ones_like(F[:1])])
+    )
+    io.write_obj(tmp_path / "model.obj", mesh)
+    one = Visitor(tmp_path / "model.obj")
+    assert one.session.state.mapped
+    saved = one.session.state.sheet.mapped_file(one.session.state.mesh)
+    assert np.array_equal(saved.corner_uv[: len(F)], mesh.corner_uv[: len(F)])

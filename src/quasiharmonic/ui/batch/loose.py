@@ -65,7 +65,7 @@ class LooseProblems:
             count += self._shard.contains(files.name)
         if none:
             raise ValueError(
-                f"there are no problems in {self._source}: a problem is a folder with input.obj and handles.txt"
+                f"no problems in {self._source}: a problem is a folder with input.obj (or .ply) and handles.txt"
                 + (
                     ""
                     if self.orders.settings.plain

@@ -188,7 +188,7 @@ def _read_list(path: Path, plain: bool) -> Iterator[ProblemFiles]:
                     seen.add(problem.name)
                     yield problem
             if none:
-                wanted = "a mesh" if plain else "a folder with input.obj"
+                wanted = "a mesh" if plain else "a folder with input.obj or input.ply"
                 raise ValueError(
                     f"{path}: line {number}: there is no problem in the folder {text[:100]!r}: give {wanted}, or a "
                     "folder that contains such folders"

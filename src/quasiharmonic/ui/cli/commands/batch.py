@@ -58,7 +58,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR_OR_LIST",
         type=_location,
         nargs="?",
-        help="folder with problems (input.obj and handles.txt) at any depth, archives of problems (.tar, .parquet; a "
+        help="folder with problems (input.obj or .ply, handles) at any depth, archives of problems (.tar, .parquet; a "
         "folder of them, data-{0000..0015}.tar, or a URL), or a text file that lists folders, meshes or archives, one "
         "per line; may be omitted with --report",
     )

@@ -49,7 +49,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help=f"{format_names('read')} file, a finite-element mesh ({format_names('read_elements')}), or a folder with "
-        "input.obj and handles.txt",
+        "input.obj (or .ply) and handles.txt",
     )
     add_options(
         parser, fixed=file("file of fixed vertices for the obstructions, 0-based, one per line (default: the boundary)")

@@ -50,7 +50,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
 
     add_files(
         parser,
-        f"{format_names('read')} file, or a folder with input.obj and handles.txt",
+        f"{format_names('read')} file, or a folder with input.obj (or .ply) and handles.txt",
         f"{format_names('write_map')} file to write",
     )
     map_options.add_options(parser)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 def declare_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    add_files(parser, "OBJ file, or a folder with input.obj and handles.txt", "OBJ file to write")
+    add_files(parser, "OBJ file, or a folder with input.obj (or .ply) and handles.txt", "OBJ file to write")
     add_options(parser, "fixed", "json")
 
 

@@ -27,7 +27,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="?",
         metavar="INPUT",
-        help=f"{format_names('read')} file, or a folder with input.obj and handles.txt (default: a cat's head)",
+        help=f"{format_names('read')} file, or a folder with input.obj (or .ply), handles.txt (default: a cat's head)",
     )
     parser.add_argument("--port", type=int, default=0, metavar="N", help="port to listen on (default: any free port)")
     parser.add_argument("--no-browser", action="store_true", help="print the address and do not open the browser")

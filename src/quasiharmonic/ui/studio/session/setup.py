@@ -24,7 +24,7 @@ from quasiharmonic.ui.studio.session.operations import (
 from quasiharmonic.ui.studio.session.outlines import make_outline
 from quasiharmonic.ui.studio.session.recipes import Recipe
 from quasiharmonic.ui.studio.session.state import SessionState
-from quasiharmonic.ui.studio.session.surface import PageSurface, has_complete_map
+from quasiharmonic.ui.studio.session.surface import PageSurface
 from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray
@@ -49,7 +49,7 @@ def make_first_state(sheet: PageSurface, callback: Callable[[Any], object] | Non
     coordinates, these stay, and the others are unwrapped.
     """
     bare = open_without_map(sheet)
-    if has_complete_map(sheet.mesh) or (sheet.fixed is not None and sheet.is_file and sheet.mesh.FT is not None):
+    if sheet.has_complete_map or (sheet.fixed is not None and sheet.is_file and sheet.mesh.FT is not None):
         return _take_map(sheet, callback)
     if len(sheet.unmapped):
         return bare if len(sheet.unmapped) > MAX_AUTOMATIC else unwrap_model(bare, callback)

@@ -67,9 +67,15 @@ class PageSurface:
         bare = (self.from_file(self.mesh.FT) < 0).any(axis=1)
         return np.flatnonzero(bare & (not bare.all()))
 
+    @property
+    def has_complete_map(self) -> bool:
+        """Whether the file has texture coordinates for every triangle of the surface."""
+        FT = self.mesh.FT
+        return self.mesh.vt is not None and FT is not None and bool((self.from_file(FT) >= 0).all())
+
     def initial_map(self) -> SeamedMesh:
         """Return the surface with the seams and the map of the file, without map if the file has none."""
-        if self.mesh.FT is None or self.mesh.vt is None or (not self.is_file and (self.mesh.FT < 0).any()):
+        if self.mesh.FT is None or self.mesh.vt is None or (not self.is_file and not self.has_complete_map):
             return SeamedMesh(self.surface.V, self.surface.F)
         if self.is_file:
             return io.seamed(self.mesh)
@@ -149,8 +155,3 @@ def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> P
     surface = io.MeshData(cleaned.V, cleaned.F, source=mesh.source)
     own = None if fixed is None else np.flatnonzero(np.isin(cleaned.vertices, fixed))
     return PageSurface(name, mesh, surface, report, cleaned, fixed=own, texture=texture)
-
-
-def has_complete_map(mesh: io.MeshData) -> bool:
-    """Return whether every triangle of a file has texture coordinates."""
-    return not np.isnan(mesh.corner_uv).any()
