@@ -20,13 +20,13 @@ import numpy as np
 from quasiharmonic.apps.flattening.patches import mark_around
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
+from quasiharmonic.apps.unwrapping.hinges import find_pairs
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.geometry.coarsening.levels import Removal, has_marked_corner
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.fans import split_parts
 from quasiharmonic.geometry.mesh.reference import surface_area
-from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
@@ -42,7 +42,7 @@ _NO_CUT = np.empty((0, 2), dtype=np.int64)
 
 
 class CoarseSearch:
-    """A search for charts on the coarse mesh of a surface with ``n`` vertices; ``names`` (m,) are those of its part."""
+    """A search for charts on the coarse mesh of a surface; ``names`` (m,) are its part's vertices of ``V`` (n, 3)."""
 
     def __init__(self, bound: float, workers: Workers, V: FloatArray, names: IntArray) -> None:
         self._bound, self._workers, self._V, self._names = bound, workers, V, names
@@ -154,9 +154,6 @@ def _direction(p: ComplexArray) -> ComplexArray:
 
 def _repair(chart: WorkingChart, uv: FloatArray, inverted: BoolArray) -> FloatArray | None:
     """Map the surroundings of inverted triangles (f,) anew, with all other vertices fixed; None if that fails."""
-    # Few surfaces need this, and it imports the whole solver.
-    from quasiharmonic.solver.mapping import injective_map
-
     if is_injective(chart.F, uv):
         return uv
     if np.count_nonzero(inverted) > _FEW * len(chart.F):
@@ -166,6 +163,9 @@ def _repair(chart: WorkingChart, uv: FloatArray, inverted: BoolArray) -> FloatAr
     rows = np.flatnonzero(has_marked_corner(chart.F, loose))
     if not rows.size:
         return None
+    # Few surfaces need this, and it imports the whole solver.
+    from quasiharmonic.solver.mapping import injective_map
+
     for _, T, vertices in split_parts(chart.F[rows], rows, _NO_CUT, n):
         fixed = np.flatnonzero(~loose[vertices])
         try:
@@ -187,10 +187,7 @@ def _carry_rotations(F: IntArray, g: ComplexArray, w: ComplexArray, known: BoolA
     if not done.any():
         return None
     turned = _direction(p)
-    sides = edge_keys(F, F[:, (1, 2, 0)], len(w)).ravel()
-    order = np.argsort(sides, kind="stable")
-    pairs = np.flatnonzero(np.diff(sides[order]) == 0)
-    one, other = order[pairs], order[pairs + 1]
+    one, other = find_pairs(F)
     # Side k of a triangle is orthogonal to the gradient at its opposite corner.
     side = np.ascontiguousarray(g[(2, 0, 1), :].T).ravel()
     turn = -side[one] / side[other]
