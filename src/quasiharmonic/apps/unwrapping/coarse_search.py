@@ -5,8 +5,8 @@ coarse chart keeps its position in that chart's map, and so do vertices that are
 give the rotations of their triangles. The triangles near seams get theirs by unfolding from their neighbours. The map
 is fitted to the rotated triangles [1]_, then to the nearest ones that are stretched little, which is repeated. All
 systems have one unknown per vertex and the same matrix. Triangles that collapse or invert meanwhile are rotated anew,
-as their neighbours unfold. The surroundings of the few triangles that stay inverted are mapped by `injective_map`. A map
-whose boundary meets itself is not used.
+as their neighbours unfold. The surroundings of the few triangles that stay inverted are mapped by `injective_map`. A
+map whose boundary meets itself is not used.
 
 References
 ----------
