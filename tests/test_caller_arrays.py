@@ -123,7 +123,7 @@ def test_triangles_that_another_thread_overwrites(seconds):
 KERNELS = {
     "geometry.exact.triangles": ["sure_signs", "count_turns"],
     "geometry.exact.loops": ["doubtful_pairs"],
-    "geometry.mesh.topology": ["sort_edges", "link_nodes", "follow_loops"],
+    "geometry.mesh.topology": ["sort_edges", "number_sides", "link_nodes", "follow_loops"],
     "geometry.mesh.reference": ["lay_flat", "wirtinger"],
     "energies.deformation": ["jacobians", "pulls", "collapses"],
     "linsolve.pattern": ["find_pattern"],

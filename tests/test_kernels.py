@@ -121,6 +121,7 @@ _ANY_LENGTH = {
     "wirtinger": {0},
     "lay_flat": {0},
     "sort_edges": {0},
+    "number_sides": {0},
     "link_nodes": {2},
     "jacobians": {0},
     "pulls": {5},

@@ -44,6 +44,23 @@ def _(rng):
     return soup(rng, 9, 0), 0, np.zeros((0, 2), dtype=np.int64), np.zeros(4, dtype=np.int64)
 
 
+@arguments_of("number_sides")
+def _(rng):
+    return soup(rng, 9, 70), 9, np.zeros((70, 3), dtype=np.int64), np.zeros((210, 2), dtype=np.int64)
+
+
+@arguments_of("number_sides")
+def _(rng):
+    """A fan around the first vertex."""
+    F = np.stack([np.zeros(99, dtype=np.int64), np.arange(1, 100), rng.permutation(np.arange(2, 101))], axis=1)
+    return F, 101, np.zeros((99, 3), dtype=np.int64), np.zeros((297, 2), dtype=np.int64)
+
+
+@arguments_of("number_sides")
+def _(rng):
+    return soup(rng, 9, 5), 4, np.zeros((5, 3), dtype=np.int64), np.zeros((15, 2), dtype=np.int64)
+
+
 @arguments_of("link_nodes")
 def _(rng):
     """Columns of triangles, as for connected components."""

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import KEPT_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.mesh.fans import fans, renumber
-from quasiharmonic.geometry.mesh.topology import label_components
+from quasiharmonic.geometry.mesh.topology import label_components, pair_sides
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
@@ -104,7 +104,7 @@ def _excess(chart: WorkingChart, bound: float) -> FloatArray:
 
 def is_undivided(chart: WorkingChart) -> bool:
     """Return whether all triangles of a chart should stay together, such as those of one polygon."""
-    return not _group_undivided(chart.cost, _graph(chart)).any()
+    return bool((chart.cost >= UNDIVIDED_COST).any()) and not _group_undivided(chart.cost, _graph(chart)).any()
 
 
 def _graph(chart: WorkingChart) -> EdgeGraph:
@@ -229,8 +229,11 @@ def _group_undivided(cost: FloatArray, graph: EdgeGraph, least: float = UNDIVIDE
 
     ``cost`` (k, 3) are the factors of the sides; triangles stay together at factors of at least ``least``.
     """
+    dear_sides = cost >= least
+    if not dear_sides.any():
+        return np.arange(len(cost))
     first, second, edge = _pairs(graph)
-    dear = mark(len(graph.ends), graph.side.T[cost >= least])
+    dear = mark(len(graph.ends), graph.side.T[dear_sides])
     joined = dear[edge]
     return label_components(first[joined], second[joined], len(cost))
 
@@ -244,10 +247,8 @@ def _mean_of_groups(values: FloatArray, group: IntArray) -> FloatArray:
 
 def _pairs(graph: EdgeGraph) -> tuple[IntArray, IntArray, IntArray]:
     """The two triangles (e,) at each interior edge, and the edges (e,)."""
-    side = graph.side.T.ravel()
-    order = np.argsort(side, kind="stable")
-    first = np.flatnonzero(np.diff(side[order]) == 0)
-    return order[first] // 3, order[first + 1] // 3, side[order[first]]
+    one, other = pair_sides(graph.side.T)
+    return one // 3, other // 3, graph.side.T.ravel()[one]
 
 
 def _open(chart: WorkingChart, cut: BoolArray) -> list[WorkingChart]:

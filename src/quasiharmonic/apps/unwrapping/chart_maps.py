@@ -182,10 +182,11 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
             chart.stretch = np.full(len(chart.F), np.inf)
             return
         chart.use(uv)
-        if chart.start is not None and chart.too_long.any() and chart.share_over(bound) <= FREE_SHARE:
+        if chart.start is not None:
             _relax_long(chart, bound)
         if flat is None and not (chart.start is not None and keeps_bound(chart, bound)):
             _descend(chart, SymmetricDirichlet(), check_wanted)
+            _relax_long(chart, bound)
         if keeps_bound(chart, bound):
             return
     else:
@@ -243,7 +244,12 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
 
 
 def _relax_long(chart: WorkingChart, bound: float) -> None:
-    """Lower the stretch around triangles that are stretched too much, with the rest of the map fixed."""
+    """Lower the stretch around triangles that are stretched too much, with the rest of the map fixed.
+
+    Without effect where too much of the chart exceeds the bound, so that all of the map must change.
+    """
+    if not chart.too_long.any() or chart.share_over(bound) > FREE_SHARE:
+        return
     assert chart.uv is not None
     density = EvenStretch(bound)
     moved = descend_on_patches(chart.piece.energy(density, None), density, chart.uv, chart.too_long, "auto")

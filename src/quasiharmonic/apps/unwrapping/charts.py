@@ -26,9 +26,9 @@ from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.fans import fans, renumber, split_parts
 from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
-from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.topology import are_sides, boundary_edges, edge_keys
 from quasiharmonic.targets.cuts.find import find_cuts_by
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, repeat_each, scale_to_unit
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, mark, repeat_each, scale_to_unit
 
 #: Default of ``max_stretch``.
 MAX_STRETCH = 1.5
@@ -189,11 +189,15 @@ def _develop(
         workers.check_wanted,
         None if mirror is None else mirror.select(rows),
     )
-    apart = int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1
-    if max_charts is None or len(charts) + len(more) + apart <= max_charts:
+    if max_charts is None or _count_components(F[rows[~developed]]) <= max_charts - len(charts) - len(more):
         charts += [replace(chart, triangles=rows[chart.triangles]) for chart in more]
         mask[rows[developed]] = True
     return mask, charts
+
+
+def _count_components(F: IntArray) -> int:
+    """Number of the surfaces that triangles (k, 3) form."""
+    return int(fans(F)[1].max(initial=-1)) + 1
 
 
 def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, list[Chart]]:
@@ -220,10 +224,13 @@ def _unfold_small(
     """Unfold small closed components without cuts; return a mask (f,) of their triangles, and their charts."""
     mask, charts = np.zeros(len(F), dtype=bool), list[Chart]()
     component = fans(F)[1]
+    chosen = np.bincount(component) <= _SMALL
+    if not chosen.any():
+        return mask, charts
+    area = np.linalg.norm(area_vectors(V, F), axis=1)
+    chosen &= np.bincount(component, area) <= _SMALL_SHARE * area.sum()
     sides = edge_keys(F, F[:, (1, 2, 0)], len(V))
     _, edge, times = np.unique(sides, return_inverse=True, return_counts=True)
-    area = np.linalg.norm(area_vectors(V, F), axis=1)
-    chosen = (np.bincount(component) <= _SMALL) & (np.bincount(component, area) <= _SMALL_SHARE * area.sum())
     chosen[component[((times[edge].reshape(sides.shape) < 2) | demanded).any(axis=1)]] = False
     rows = np.flatnonzero(chosen[component])
     if not rows.size:
@@ -284,14 +291,14 @@ def _cut(
     ``given`` cuts are demanded.
     """
     n = len(V)
-    sides = edge_keys(F[rows], F[rows][:, (1, 2, 0)], n)
-    there = given[np.isin(pair_keys(given, n), sides)]
-    vertices, own = np.unique(F[rows], return_inverse=True)
+    there = given[are_sides(given, F[rows], n)]
+    vertices = np.flatnonzero(mark(n, F[rows]))
+    own = invert_indices(n, vertices)[F[rows]]
     coarse = None if search_first is None else search_first(vertices)
     cut = vertices[
         find_cuts_by(
             V[vertices],
-            own.reshape(-1, 3),
+            own,
             np.searchsorted(vertices, there),
             cost[rows],
             min_gain if len(there) else _MIN_GAIN,

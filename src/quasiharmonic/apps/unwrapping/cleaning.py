@@ -23,6 +23,7 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_weld,
     count_of,
+    mark,
     number_array,
     triangle_array,
     vertex_array,
@@ -255,7 +256,7 @@ def clean(
         flipped = flipped ^ (facing < 0)[component]
         facing = np.abs(facing)
     matched = exclusion.substitute_corners
-    distinct = np.unique(joint[corners])
+    distinct = np.flatnonzero(mark(len(V), joint[corners]))
     return CleanedMesh(
         V=positions,
         F=_turn(number, flipped),
@@ -293,6 +294,8 @@ def _number(fan: IntArray, corners: IntArray) -> tuple[IntArray, IntArray]:
 
 def _find_edges(joint: IntArray, corners: IntArray, pairs: IntArray) -> IntArray:
     """Return edges (k, 2) of triangles ``joint`` (f, 3) by the vertices ``corners`` (f, 3) at one of their sides."""
+    if not len(pairs):
+        return pairs
     n = int(joint.max()) + 1
     keys, side = np.unique(edge_keys(joint, joint[:, (1, 2, 0)], n), return_index=True)
     side = side[np.searchsorted(keys, pair_keys(pairs, n))]

@@ -4,8 +4,9 @@ The seams of all charts of the coarse mesh are carried to the surface and shorte
 coarse chart keeps its position in that chart's map, and so do vertices that are inserted between such vertices. They
 give the rotations of their triangles. The triangles near seams get theirs by unfolding from their neighbours. The map
 is fitted to the rotated triangles [1]_, then to the nearest ones that are stretched little, which is repeated. All
-systems have one unknown per vertex and the same matrix. The surroundings of the few triangles that stay inverted are
-mapped by `injective_map`. A map whose boundary meets itself is not used.
+systems have one unknown per vertex and the same matrix. Triangles that collapse or invert meanwhile are rotated anew,
+as their neighbours unfold. The surroundings of the few triangles that stay inverted are mapped by `injective_map`. A
+map whose boundary meets itself is not used.
 
 References
 ----------
@@ -20,13 +21,13 @@ import numpy as np
 from quasiharmonic.apps.flattening.patches import mark_around
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
-from quasiharmonic.apps.unwrapping.hinges import find_pairs
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.geometry.coarsening.levels import Removal, has_marked_corner
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.fans import split_parts
 from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
@@ -36,6 +37,8 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 _FITS, _LEAST_FITS, _MOST_FITS = 4, 6, 16
 # A fit permits this share of the stretch that the bound permits.
 _PERMITTED = 0.5
+# A triangle whose singular values have a smaller ratio gets a new rotation.
+_LEAST_RATIO = 0.15
 # Maps with a larger share of inverted triangles are not repaired.
 _FEW = 0.01
 _NO_CUT = np.empty((0, 2), dtype=np.int64)
@@ -119,7 +122,8 @@ def _fit(
     """
     F, n = chart.F, len(w)
     corners = np.ascontiguousarray(F.T)
-    turned = _carry_rotations(F, g, w, known)
+    unfolding = _Unfolding(F, g)
+    turned = unfolding.carry(w, known)
     if turned is None:
         return None
     area = 1 / np.abs((g[1].conj() * g[2]).imag)
@@ -138,8 +142,17 @@ def _fit(
             break
         # At first the targets are rotations, then the nearest matrices with little stretch.
         less = 1.0 if k < _FITS else most
+        rotation, collapsed = _direction(p), smaller <= _LEAST_RATIO * larger
         larger, smaller = np.clip(larger, 1 / less, less), np.clip(smaller, 1 / less, less)
-        target = 0.5 * (larger + smaller) * _direction(p) - p, 0.5 * (larger - smaller) * _direction(q) - q
+        if collapsed.any():
+            # The boundary would stay folded where the rotations of these triangles are wrong.
+            around = mark_around(F, collapsed, n)
+            carried = unfolding.carry(w, ~around)
+            if carried is not None:
+                near = has_marked_corner(F, around)
+                rotation[near] = carried[near]
+                larger[near] = smaller[near] = 1.0
+        target = 0.5 * (larger + smaller) * rotation - p, 0.5 * (larger - smaller) * _direction(q) - q
         load = area * (target[0] * g + target[1] * g.conj())
         w = w + fitted.respond(sum_at(corners.ravel(), load.ravel(), n))
     if not np.isfinite(w).all() or len(check_loops(chart.piece.loops, to_points(w))[0]):
@@ -176,33 +189,39 @@ def _repair(chart: WorkingChart, uv: FloatArray, inverted: BoolArray) -> FloatAr
     return uv if is_injective(chart.F, uv) else None
 
 
-def _carry_rotations(F: IntArray, g: ComplexArray, w: ComplexArray, known: BoolArray) -> ComplexArray | None:
-    """Return the rotation (f,) of each triangle: by a map w (n,), or as its neighbours unfold if a corner is unknown.
+class _Unfolding:
+    """Rotations of triangles (f, 3) as they unfold from their neighbours; ``g`` (3, f) is as in `NewtonSystem`."""
 
-    None if no triangle has known corners.
-    """
-    at = w[np.ascontiguousarray(F.T)]
-    p, q = (g.conj() * at).sum(axis=0), (g * at).sum(axis=0)
-    done = known[F].all(axis=1) & (np.abs(p) > np.abs(q))
-    if not done.any():
-        return None
-    turned = _direction(p)
-    one, other = find_pairs(F)
-    # Side k of a triangle is orthogonal to the gradient at its opposite corner.
-    side = np.ascontiguousarray(g[(2, 0, 1), :].T).ravel()
-    turn = -side[one] / side[other]
-    turn /= np.abs(turn)
-    source, there = np.concatenate([one, other]) // 3, np.concatenate([other, one]) // 3
-    turn = np.concatenate([turn, turn.conj()])
-    left = ~done[there]
-    source, there, turn = source[left], there[left], turn[left]
-    while True:
-        reached = done[source]
-        if not reached.any():
-            return turned
-        new = there[reached]
-        total = sum_at(new, turned[source[reached]] * turn[reached], len(F))
-        turned[new] = _direction(total[new])
-        done[new] = True
-        left = ~done[there]
-        source, there, turn = source[left], there[left], turn[left]
+    def __init__(self, F: IntArray, g: ComplexArray) -> None:
+        self._F, self._g = F, g
+        one, other = find_pairs(F)
+        # Side k of a triangle is orthogonal to the gradient at its opposite corner.
+        side = np.ascontiguousarray(g[(2, 0, 1), :].T).ravel()
+        turn = -side[one] / side[other]
+        turn /= np.abs(turn)
+        self._source, self._there = np.concatenate([one, other]) // 3, np.concatenate([other, one]) // 3
+        self._turn = np.concatenate([turn, turn.conj()])
+
+    def carry(self, w: ComplexArray, known: BoolArray) -> ComplexArray | None:
+        """Return the rotation (f,) of each triangle by a map w (n,), carried on to triangles with unknown corners.
+
+        None if no triangle has known corners.
+        """
+        at = w[np.ascontiguousarray(self._F.T)]
+        p, q = (self._g.conj() * at).sum(axis=0), (self._g * at).sum(axis=0)
+        done = known[self._F].all(axis=1) & (np.abs(p) > np.abs(q))
+        if not done.any():
+            return None
+        turned = _direction(p)
+        left = ~done[self._there]
+        source, there, turn = self._source[left], self._there[left], self._turn[left]
+        while True:
+            reached = done[source]
+            if not reached.any():
+                return turned
+            new = there[reached]
+            total = sum_at(new, turned[source[reached]] * turn[reached], len(self._F))
+            turned[new] = _direction(total[new])
+            done[new] = True
+            left = ~done[there]
+            source, there, turn = source[left], there[left], turn[left]

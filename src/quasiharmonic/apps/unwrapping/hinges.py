@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 #: Triangles on the two sides of an edge with at least this cost factor stay together, such as those of a polygon.
@@ -88,16 +88,6 @@ class Hinges:
         marked = np.zeros(3 * count, dtype=np.bool_)
         marked[self.one[chosen]] = marked[self.other[chosen]] = True
         return marked.reshape(-1, 3)
-
-
-def find_pairs(F: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the two sides of each interior edge of a surface (f, 3), the smaller first, in order of the first ones."""
-    key = edge_keys(F.ravel(), F[:, (1, 2, 0)].ravel(), int(F.max(initial=-1)) + 1)
-    order = np.argsort(key, kind="stable")
-    at = np.flatnonzero(np.diff(key[order]) == 0)
-    pairs = np.stack([order[at], order[at + 1]], axis=1)
-    one, other = pairs[np.argsort(pairs[:, 0])].T
-    return one, other
 
 
 def find_hinges(V: FloatArray, F: IntArray) -> Hinges:

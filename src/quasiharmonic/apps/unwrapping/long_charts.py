@@ -8,8 +8,8 @@ import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, is_undivided
-from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, find_pairs
-from quasiharmonic.geometry.mesh.topology import label_components
+from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
+from quasiharmonic.geometry.mesh.topology import find_pairs, label_components
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.progress import heartbeat
 

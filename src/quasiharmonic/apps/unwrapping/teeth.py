@@ -12,8 +12,9 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
-from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, find_pairs
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.mesh.reference import rest_shapes
+from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.targets.cuts.graph import edge_graph
 from quasiharmonic.util.arrays import ComplexArray, IntArray, to_complex, to_points
 

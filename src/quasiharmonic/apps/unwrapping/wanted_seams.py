@@ -13,7 +13,7 @@ from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.pieces import find_pieces
 from quasiharmonic.geometry.mesh.fans import fans
-from quasiharmonic.geometry.mesh.topology import edge_keys, label_components, pair_keys
+from quasiharmonic.geometry.mesh.topology import are_sides, edge_keys, label_components, mark_sides, pair_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_range, edge_names, index_array, mark
 
 
@@ -31,9 +31,12 @@ class WantedSeams:
 
     def check(self, cleaned: CleanedMesh, found: IntArray) -> None:
         """Raise a ValueError unless the seams (s, 2) that were found are as wanted."""
+        if self.empty:
+            return
         n = len(cleaned.representatives)
         present = pair_keys(cleaned.representatives[found], n)
-        keys, times = np.unique(_cleaned_keys(cleaned), return_counts=True)
+        corners = cleaned.representatives[cleaned.corners]
+        keys, times = np.unique(edge_keys(corners, corners[:, (1, 2, 0)], n), return_counts=True)
         unwanted = pair_keys(self.no_seams, n)
         wrong = self.no_seams[np.isin(unwanted, present) & np.isin(unwanted, keys)]
         if len(wrong):
@@ -65,8 +68,7 @@ def read_edges(name: str, given: ArrayLike | None, F: IntArray, joint: IntArray)
         raise ValueError(f"{name} must have shape (k, 2), two vertices each, not {edges.shape}")
     check_range(name, edges, n)
     merged = np.sort(joint[edges], axis=1)
-    there = edge_keys(joint[F], joint[F[:, (1, 2, 0)]], n)
-    absent = ~np.isin(pair_keys(merged, n), there) | (merged[:, 0] == merged[:, 1])
+    absent = ~are_sides(merged, joint[F], n) | (merged[:, 0] == merged[:, 1])
     if absent.any():
         raise ValueError(f"{name}: {edge_names(edges[absent])}: not an edge of the mesh")
     return np.unique(merged, axis=0)
@@ -74,13 +76,7 @@ def read_edges(name: str, given: ArrayLike | None, F: IntArray, joint: IntArray)
 
 def mark_edges(cleaned: CleanedMesh, edges: IntArray) -> BoolArray:
     """Return a mask (f', 3) of the sides of the cleaned mesh at edges (k, 2), given by representatives."""
-    return np.isin(_cleaned_keys(cleaned), pair_keys(edges, len(cleaned.representatives)))
-
-
-def _cleaned_keys(cleaned: CleanedMesh) -> IntArray:
-    """Return keys (f', 3) of the sides of the cleaned triangles, by the model's vertices after merging."""
-    corners = cleaned.representatives[cleaned.corners]
-    return edge_keys(corners, corners[:, (1, 2, 0)], len(cleaned.representatives))
+    return mark_sides(cleaned.representatives[cleaned.corners], edges, len(cleaned.representatives))
 
 
 def extend_seams(V: FloatArray, F: IntArray, hinges: Hinges, demanded: BoolArray, cost: FloatArray) -> BoolArray:

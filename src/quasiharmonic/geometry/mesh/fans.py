@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.topology import are_collapsed, edge_keys, label_components, pair_keys
+from quasiharmonic.geometry.mesh.topology import are_collapsed, are_sides, find_pairs, label_components, mark_sides
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -49,12 +49,7 @@ def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]
     corner = np.arange(F.size).reshape(-1, 3)
     tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
     ahead = corner[:, (1, 2, 0)].ravel()
-    key = edge_keys(tail, head, int(F.max(initial=0)) + 1)
-    # The order of equal keys has no effect.
-    order = np.argsort(key)
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    first = first[np.diff(first, append=key.size) == 2]
-    one, other = order[first], order[first + 1]
+    one, other = find_pairs(F)
     opposed = (tail[one] == head[other]) & (tail[one] != tail[other])
     if cut is not None:
         opposed &= ~(cut.ravel()[one] | cut.ravel()[other])
@@ -120,17 +115,10 @@ def open_along(F: IntArray, cut: IntArray, n: int) -> FanCorners:
     without a common edge are split, too. Raises a ValueError that names the first cuts that are not edges of the mesh.
     """
     check_range("edges", cut, n)
-    # Few sides have both ends on a cut, and only these are searched.
-    marked = mark(n, cut)
-    at_corner = marked[F]
-    open_side = at_corner & at_corner[:, (1, 2, 0)]
-    sides = edge_keys(F[open_side], F[:, (1, 2, 0)][open_side], n)
-    wanted = pair_keys(cut, n)
-    unknown = ~np.isin(wanted, sides)
+    unknown = ~are_sides(cut, F, n)
     if unknown.any():
         raise ValueError(f"{edge_names(cut[unknown])}: not an edge of the mesh")
-    open_side[open_side] = np.isin(sides, wanted)
-    return FanCorners(*number_fans(F, fans(F, open_side)[0], n))
+    return FanCorners(*number_fans(F, fans(F, mark_sides(F, cut, n))[0], n))
 
 
 def make_fans(loops: Sequence[IntArray], n: int) -> IntArray:
@@ -141,8 +129,7 @@ def make_fans(loops: Sequence[IntArray], n: int) -> IntArray:
 
 def split_parts(F: IntArray, rows: IntArray, cut: IntArray, n: int) -> list[tuple[IntArray, IntArray, IntArray]]:
     """Split triangles along edges (l, 2); return rows, triangles by own vertices, and vertices of each part."""
-    sides = edge_keys(F, F[:, (1, 2, 0)], n)
-    split, component = fans(F, np.isin(sides, pair_keys(cut, n)))
+    split, component = fans(F, mark_sides(F, cut, n))
     order = np.argsort(component, kind="stable")
     parts = []
     for some in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):

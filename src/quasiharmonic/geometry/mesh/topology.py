@@ -22,6 +22,7 @@ from quasiharmonic.util.arrays import (
     edge_names,
     first_equal,
     make_unchangeable,
+    mark,
     own_triangles,
     repeat_each,
     triangle_names,
@@ -98,6 +99,52 @@ def sort_edges(F: IntArray, n: int, pairs: IntArray, sizes: IntArray) -> int:
     return 1
 
 
+def find_sides(F: NDArray[np.integer], n: int) -> tuple[IntArray, IntArray]:
+    """Return the undirected edges (e, 2) of triangles in ascending order, smaller end first, and those of the sides.
+
+    The latter are (f, 3), from each corner to the next. ``n`` must be below 2³¹.
+    """
+    T = own_triangles(F)
+    side, ends = np.empty(T.shape, dtype=np.int64), np.empty((T.size, 2), dtype=np.int64)
+    count = number_sides(T, n, side, ends)
+    if count < 0:
+        check_range("F", T, n)
+    return ends[:count].copy(), side
+
+
+@compiled
+def number_sides(F: IntArray, n: int, side: IntArray, ends: IntArray) -> int:
+    """Fill in the result of `find_sides`; return the number of edges, or -1 if F is out of range."""
+    if F.size and (F.min() < 0 or F.max() >= n):
+        return -1
+    keys, number = np.unique(edge_keys(F, F[:, (1, 2, 0)], n), return_inverse=True)
+    side[:] = number.reshape(-1, 3)
+    ends[: keys.size] = np.stack(np.divmod(keys, max(n, 1)), axis=1)
+    return keys.size
+
+
+def find_pairs(F: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the two sides of each edge of exactly two triangles (f, 3), the smaller first, in order of the first ones.
+
+    Side 3 t + k runs from corner k of triangle t to the next.
+    """
+    return pair_sides(find_sides(F, int(F.max(initial=-1)) + 1)[1])
+
+
+def pair_sides(side: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the result of `find_pairs`, given the edge (f, 3) of each side."""
+    side = side.ravel()
+    first, last = np.empty((2, int(side.max(initial=-1)) + 1), dtype=np.int64)
+    here = np.arange(side.size)
+    last[side] = here
+    first[side[::-1]] = here[::-1]
+    two = np.bincount(side, minlength=first.size) == 2
+    other = np.full(side.size, -1)
+    other[first[two]] = last[two]
+    one = np.flatnonzero(other >= 0)
+    return one, other[one]
+
+
 _Integers = NDArray[np.integer]
 
 
@@ -138,6 +185,27 @@ def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> I
 def pair_keys(pairs: IntArray, n: int) -> IntArray:
     """The `edge_keys` of edges (k, 2) given by their ends; (k,) int64."""
     return edge_keys(pairs[:, 0], pairs[:, 1], n)
+
+
+def mark_sides(F: IntArray, pairs: IntArray, n: int) -> BoolArray:
+    """Return a mask (f, 3) of the sides of triangles (f, 3) at edges (k, 2), given by their ends."""
+    # Few sides have both ends on an edge, and only these are searched.
+    sides, keys = _sides_between(F, pairs, n)
+    sides[sides] = np.isin(keys, pair_keys(pairs, n))
+    return sides
+
+
+def are_sides(pairs: IntArray, F: IntArray, n: int) -> BoolArray:
+    """Return which pairs of vertices (k, 2) are sides of triangles (f, 3)."""
+    found: BoolArray = np.isin(pair_keys(pairs, n), _sides_between(F, pairs, n)[1])
+    return found
+
+
+def _sides_between(F: IntArray, pairs: IntArray, n: int) -> tuple[BoolArray, IntArray]:
+    """Return a mask (f, 3) of the sides with both ends in some pairs, and the keys of these sides."""
+    at_corner = mark(n, pairs)[F]
+    sides: BoolArray = at_corner & at_corner[:, (1, 2, 0)]
+    return sides, edge_keys(F[sides], F[:, (1, 2, 0)][sides], n)
 
 
 def are_collapsed(F: IntArray) -> BoolArray:

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from quasiharmonic.geometry.coarsening.levels import Removal
 from quasiharmonic.geometry.mesh.fans import open_along
-from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges, pair_keys
+from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges, mark_sides, pair_keys
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.targets.cuts.levels import cut_by_levels
@@ -218,11 +218,7 @@ def _costs_of_sides(F: IntArray, n: int, spared: IntArray, edge_costs: ArrayLike
     """Return the costs (f, 3) of all sides, high at the spared edges (d, 2); None if all are 1."""
     costs = np.ones(F.shape) if edge_costs is None else side_costs(edge_costs, len(F))
     if spared.size:
-        marked = np.zeros(n, dtype=bool)
-        marked[spared] = True
-        side = marked[F] & marked[F[:, (1, 2, 0)]]
-        keys = edge_keys(F[side], F[:, (1, 2, 0)][side], n)
-        costs[side] *= np.where(np.isin(keys, pair_keys(spared, n)), _DEAR, 1.0)
+        costs[mark_sides(F, spared, n)] *= _DEAR
     elif edge_costs is None:
         return None
     return costs
@@ -238,12 +234,10 @@ def _cut_part(graph: EdgeGraph, min_gain: float) -> BoolArray:
 
 def _open_keys(F: IntArray, FT: IntArray, given: IntArray, n: int) -> IntArray:
     """Keys of the given edges that are open, so that their two sides are separate edges."""
-    tail, head = F.ravel(), np.roll(F, -1, axis=1).ravel()
-    key = edge_keys(tail, head, n)
-    there = np.isin(key, pair_keys(given, n))
-    side = edge_keys(FT.ravel(), np.roll(FT, -1, axis=1).ravel(), int(FT.max()) + 1)[there]
+    there = mark_sides(F, given, n)
+    side = edge_keys(FT[there], FT[:, (1, 2, 0)][there], int(FT.max()) + 1)
     _, which, count = np.unique(side, return_inverse=True, return_counts=True)
-    return key[there][count[which] == 1]
+    return edge_keys(F[there], F[:, (1, 2, 0)][there], n)[count[which] == 1]
 
 
 def _parts(F: IntArray, n: int) -> Iterator[tuple[IntArray, IntArray, IntArray]]:

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.geometry.coarsening.levels import has_marked_corner
 from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
-from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, pair_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, pad_to_space, repeat_each, scale_to_unit
 
 # A concave edge with this dihedral bend, or a convex edge with twice as much, has half its cost.
@@ -206,14 +206,10 @@ def edge_graph(V: FloatArray, F: IntArray, costs: FloatArray | None = None) -> E
     if area > 0:
         space /= np.sqrt(area)
 
-    found = edges(F, len(V))
-    ends = np.concatenate([found.interior, np.sort(found.boundary, axis=1)])
-    rim = np.arange(len(ends)) >= len(found.interior)
-    key = pair_keys(ends, len(V))
-    order = np.argsort(key)
-    ends, rim, key = ends[order], rim[order], key[order]
-    tail, head = F.T, F.T[(1, 2, 0), :]
-    side = np.searchsorted(key, edge_keys(tail, head, len(V)))
+    ends, side_of = find_sides(F, len(V))
+    side = np.ascontiguousarray(side_of.T)
+    count = np.bincount(side.ravel())
+    rim = count == 1
 
     along = space[ends[:, 1]] - space[ends[:, 0]]
     length = np.linalg.norm(along, axis=1)
@@ -224,5 +220,5 @@ def edge_graph(V: FloatArray, F: IntArray, costs: FloatArray | None = None) -> E
     sharpness = np.minimum(np.maximum(-bend, 0.5 * bend) / _SHARP, 1)
     cost = length * (1 - _SAVED * sharpness)
     if costs is not None:
-        cost *= np.bincount(side.ravel(), costs.T.ravel()) / np.bincount(side.ravel())
+        cost *= np.bincount(side.ravel(), costs.T.ravel()) / count
     return replace(graph, cost=cost)

@@ -5,7 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-DEFINE_SORT(uint64_t)
+DEFINE_SORT(sort, uint64_t)
 
 /* Triangles, the rows of their corners or -1, and how many rows there are. */
 typedef struct {

@@ -8,9 +8,9 @@
 /* Numbers from which on a row is sorted by the library. */
 #define MANY 24
 
-/* Defines `sort(numbers, size)` for numbers of a type. */
-#define DEFINE_SORT(number) \
-    static int ascending(const void *one, const void *other) \
+/* Defines a function that sorts numbers of a type, given their size. */
+#define DEFINE_SORT(sort, number) \
+    static int sort##_compares(const void *one, const void *other) \
     { \
         const number a = *(const number *)one, b = *(const number *)other; \
         return (a > b) - (a < b); \
@@ -18,7 +18,7 @@
     static void sort(number *numbers, int64_t size) \
     { \
         if (size >= MANY) { \
-            qsort(numbers, (size_t)size, sizeof(*numbers), ascending); \
+            qsort(numbers, (size_t)size, sizeof(*numbers), sort##_compares); \
             return; \
         } \
         for (int64_t k = 1; k < size; k++) { \

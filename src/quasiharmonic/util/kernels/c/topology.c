@@ -5,7 +5,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-DEFINE_SORT(uint32_t)
+DEFINE_SORT(sort, uint32_t)
+DEFINE_SORT(sort_wide, uint64_t)
 
 /* Where the half-edges end that are of the same edge as others[from], all of them before `until`. */
 static int64_t end_of_edge(const uint32_t *others, int64_t from, int64_t until)
@@ -101,6 +102,69 @@ static PyObject *sort_edges(PyObject *module, PyObject *const *given, Py_ssize_t
     free(starts);
     free(others);
     return done_with_integer(a, LENGTH(a), 1);
+}
+
+/* The edges of triangles in ascending order, and the edge of each half-edge; returned is the number of edges. `others`
+ * gets the larger end and the number of each half-edge. */
+static int64_t number(const int64_t *F, Py_ssize_t halves, Py_ssize_t n, int64_t *starts, uint64_t *others, int64_t *side,
+                      int64_t *ends)
+{
+    memset(starts, 0, (size_t)(n + 1) * sizeof(*starts));
+    for (Py_ssize_t j = 0; j < halves; j++) {
+        const int64_t tail = F[j], head = F[j % 3 == 2 ? j - 2 : j + 1];
+        starts[tail < head ? tail : head]++;
+    }
+    for (Py_ssize_t i = 1; i <= n; i++)
+        starts[i] += starts[i - 1];
+    for (Py_ssize_t j = 0; j < halves; j++) {
+        const int64_t tail = F[j], head = F[j % 3 == 2 ? j - 2 : j + 1];
+        const int64_t low = tail < head ? tail : head;
+        others[--starts[low]] = (uint64_t)(tail < head ? head : tail) << 32 | (uint64_t)j;
+    }
+    int64_t count = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        sort_wide(others + starts[i], starts[i + 1] - starts[i]);
+        for (int64_t k = starts[i]; k < starts[i + 1]; k++) {
+            const int64_t high = (int64_t)(others[k] >> 32);
+            if (k == starts[i] || (int64_t)(others[k - 1] >> 32) != high) {
+                ends[2 * count] = i;
+                ends[2 * count++ + 1] = high;
+            }
+            side[others[k] & UINT32_MAX] = count - 1;
+        }
+    }
+    return count;
+}
+
+/* (F, n, side, ends): the number of the edges of triangles, which are listed in ascending order, and the edge of each
+ * half-edge; -1 where F names a vertex that there is not. */
+static PyObject *number_sides(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[4];
+    if (!take("number_sides", given, count, "qnQQ", a))
+        return NULL;
+    const Py_ssize_t halves = a[0].size, n = a[1].integer;
+    if (!fit("number_sides", a, LENGTH(a),
+             halves % 3 == 0 && halves <= UINT32_MAX && 0 <= n && n <= INT32_MAX && a[2].size >= halves
+                 && a[3].size >= 2 * halves))
+        return NULL;
+    if (!are_indices(a, n))
+        return done_with_integer(a, LENGTH(a), -1);
+    int64_t *starts = malloc((size_t)(n + 1) * sizeof(*starts));
+    uint64_t *others = malloc((size_t)(halves + 1) * sizeof(*others));
+    if (!starts || !others) {
+        free(starts);
+        free(others);
+        return out_of_memory(a, LENGTH(a));
+    }
+    int64_t edges;
+    Py_BEGIN_ALLOW_THREADS
+    edges = number(a[0].data, halves, n, starts, others, a[2].data, a[3].data);
+    Py_END_ALLOW_THREADS
+    free(starts);
+    free(others);
+    return done_with_integer(a, LENGTH(a), (Py_ssize_t)edges);
 }
 
 /* The root of a node, and the way there halved. */
@@ -225,5 +289,5 @@ static PyObject *follow_loops(PyObject *module, PyObject *const *given, Py_ssize
 }
 
 PyMethodDef topology_kernels[] = {
-    KERNEL(sort_edges), KERNEL(link_nodes), KERNEL(follow_loops), END_OF_KERNELS,
+    KERNEL(sort_edges), KERNEL(number_sides), KERNEL(link_nodes), KERNEL(follow_loops), END_OF_KERNELS,
 };
