@@ -1,4 +1,4 @@
-"""Compare `unwrap` with xatlas and, if bpy is installed, with two unwraps of Blender.
+"""Compare `unwrap` with xatlas and, if bpy is installed, with Blender's Smart UV Project.
 
     python benchmarks/unwrapping.py [FILE.obj | FOLDER …] [-o docs/speed/unwrapping.md] [--picture FILE]
 
@@ -21,9 +21,9 @@ os.environ.setdefault("MKL_NUM_THREADS", "1")
 
 import argparse
 import resource
-import sys
 import time
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
@@ -246,11 +246,15 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw all models and their charts")
     options = parser.parse_args()
     ways: dict[str, Unwrap] = {"`unwrap`": ours, "xatlas": by_xatlas}
+    blender = []
     if find_spec("bpy") is not None:
         ways["Smart UV Project"] = by_blender
+        blender = [f"Blender {version('bpy')}"]
     # Imports are not timed.
     unwrap(*surfaces.disk(4), resolution=64)
     lines = [
+        ", ".join([machine(), f"xatlas {version('xatlas')}", *blender]),
+        "",
         "| model | triangles | program | charts | seams | used | stretch, 99 % | worst | certified | seconds |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
@@ -268,7 +272,6 @@ def main() -> None:
         draw(options.picture, drawn)
     if options.output is not None:
         options.output.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print(machine(), file=sys.stderr)
 
 
 if __name__ == "__main__":
