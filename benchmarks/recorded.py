@@ -1,14 +1,17 @@
 """Recorded runs of other programs, and of this one where they take hours: readers and summaries.
 
     python benchmarks/recorded.py > docs/comparisons/tlc_foldover.md
+    OMP_NUM_THREADS=1 python benchmarks/recorded.py --repeat  # run this package again, and replace records/anew.csv
 
 ``records/README.md`` has the origin of the records.
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
 import gzip
+import time
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -16,25 +19,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import problems
+from quasiharmonic import Problem, distortion, polish, solve
 from quasiharmonic.util.arrays import FloatArray
+from speed import machine
 
 RECORDS = Path(__file__).parent / "records"
 #: The programs in the order of the tables: those that ran every problem of the first 68.
 PROGRAMS = "ours speed", "ours quality", "TLC-PN", "TLC-QN", "SBP", "SBP until first injective"
-#: The repeated runs: two strategies, and `Untangling` alone.
-ANEW = "anew speed", "anew paper", "anew untangling"
+#: The repeated runs of this package.
+ANEW = "anew speed"
 #: What the table calls the runs of this package.
 LABELS = {
-    "ours speed": "quasiharmonic, `speed`",
-    "anew speed": "quasiharmonic repeated, `speed`",
-    "anew paper": "quasiharmonic repeated, `paper`",
-    "anew untangling": "quasiharmonic repeated, `Untangling` alone",
+    "ours speed": "quasiharmonic",
+    ANEW: "quasiharmonic, repeated",
 }
-#: Where the runs were measured; ``records/README.md`` has the details.
-PROVENANCE = (
-    "Intel Xeon, 2 cores, 2026-11-22, quasiharmonic 0.1.0 at eb0ed78; repeated: AMD EPYC, 2 cores, 2026-11-23, "
-    "quasiharmonic 0.1.0 (development)"
-)
+#: Where the records were measured; ``records/README.md`` has the details.
+PROVENANCE = "Intel Xeon, 2 cores, 2026-11-22, quasiharmonic 0.1.0 at eb0ed78"
 #: Less than a tick of the recording clock; ratios use this value for it.
 TICK = 0.004
 #: The letters of the paper's Figure 10.
@@ -100,8 +101,9 @@ def read_records() -> list[Run]:
 
 
 def read_repeated_runs(path: Path = RECORDS / "anew.csv") -> list[Run]:
-    """Return this package's repeated runs, as written with ``-o``."""
+    """Return this package's repeated runs, as `repeat` writes them."""
     with path.open(encoding="utf-8", newline="") as file:
+        file.readline()  # machine and versions
         return [
             Run(
                 row["problem"],
@@ -127,7 +129,7 @@ def on_common_problems(runs: Iterable[Run]) -> dict[str, dict[str, Run]]:
     """Return, for each problem that all programs ran, the run of each program."""
     by_problem: dict[str, dict[str, Run]] = {}
     for run in runs:
-        if run.program in PROGRAMS + ANEW:
+        if run.program in (*PROGRAMS, ANEW):
             by_problem.setdefault(run.problem, {})[run.program] = run
     # If SBP never found an injective map, it has no run "until first injective".
     needed = set(PROGRAMS[:-1])
@@ -139,19 +141,18 @@ def summary(rows: dict[str, dict[str, Run]], programs: Sequence[str]) -> dict[st
 
     ``least`` counts the polished maps that are within 1 % of the least distorted one.
 
-    Repeated runs are compared with the first repeated program, since they share a machine.
+    The time of repeated runs is not compared, since they belong to another machine.
     """
     first = programs[0]
-    first_now = next((name for name in programs if name.startswith("anew ")), first)
     lasting = [row for row in rows.values() if row[first].start_flipped]
     shared = [row for row in lasting if all(name in row and row[name].injective for name in programs)]
     lowest = [np.nanmin([row[name].polished for name in programs]) for row in shared]
     table: dict[str, dict[str, Any]] = {}
     for name in programs:
         ran = [row[name] for row in rows.values() if name in row]
-        unit = first_now if name.startswith("anew ") else first
-        pairs = [row for row in lasting if name in row and row[name].injective and row[unit].injective]
-        ratio = np.array([max(row[name].seconds, TICK) / max(row[unit].seconds, TICK) for row in pairs])
+        pairs = [row for row in lasting if name in row and row[name].injective and row[first].injective]
+        pairs = [] if name == ANEW else pairs
+        ratio = np.array([max(row[name].seconds, TICK) / max(row[first].seconds, TICK) for row in pairs])
         table[name] = {
             "feasible solved": sum(run.injective for run in ran if run.feasible),
             "feasible": sum(row[first].feasible for row in rows.values()),
@@ -184,7 +185,7 @@ def table_text(table: dict[str, dict[str, Any]]) -> str:
     for name, row in table.items():
         ratio = ", ".join(f"{q:g}" for q in row["ratio"])
         solved = f"{row['feasible solved']} of {row['feasible']} | {row['unknown solved']} of {row['unknown']}"
-        quicker = f"{row['quicker']} of {row['of']}"
+        quicker = f"{row['quicker']} of {row['of']}" if row["of"] else ""
         lines.append(
             f"| {LABELS.get(name, name)} | {solved} | {ratio} | {quicker} | {row['MIPS']:.3g} | {row['polished']:.3g} |"
         )
@@ -193,9 +194,34 @@ def table_text(table: dict[str, dict[str, Any]]) -> str:
 
 def table_of_records() -> str:
     """Return the table of all recorded and repeated runs, without a strategy that no longer exists."""
-    programs = [name for name in (*PROGRAMS, *ANEW) if name != "ours quality"]
+    programs = [name for name in (*PROGRAMS, ANEW) if name != "ours quality"]
     table = table_text(summary(on_common_problems([*read_records(), *read_repeated_runs()]), programs))
-    return f"{PROVENANCE}\n\n{table}"
+    with (RECORDS / "anew.csv").open(encoding="utf-8") as file:
+        return f"{PROVENANCE}; repeated: {file.readline().strip()}\n\n{table}"
+
+
+def repeat(path: Path = RECORDS / "anew.csv") -> None:
+    """Run this package again on the problems of the records, certify and polish the maps, and write the runs."""
+    runs = []
+    for name, row in on_common_problems(read_records()).items():
+        made, _, triangles = name.partition(" triangles=")
+        case = problems.make(*problems.parse(made), triangles=int(triangles))
+        problem = Problem(case.V, case.F, case.fixed, case.target)
+        start = time.process_time()
+        result = solve(problem, max_iterations=2000)
+        seconds = time.process_time() - start
+        figures = [np.nan] * 3
+        if result.injective:
+            polished = polish(case.V, case.F, result.uv, fixed=case.fixed, energy="mips")
+            before, after = (distortion(case.V, case.F, uv) for uv in (result.uv, polished.uv))
+            means = [found.statistics("mips").mean for found in (before, after)]
+            figures = [*means, before.statistics("isometric").maximum]
+        inverted = row[PROGRAMS[0]].start_flipped
+        runs.append(Run(name, ANEW, len(case.F), seconds, result.injective, case.feasible, inverted, *figures))
+        print(f"{name}: {seconds:.3g} s, {'injective' if result.injective else 'no map'}", flush=True)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        file.write(f"{machine()}\n")
+        csv.writer(file, lineterminator="\n").writerows([Run._fields, *runs])
 
 
 class LetterRun(NamedTuple):
@@ -277,5 +303,15 @@ def by_family(rows: Iterable[Row]) -> dict[str, list[Row]]:
     return families
 
 
+def main() -> None:
+    """Print the table, or run this package again."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeat", action="store_true", help="run this package again instead")
+    if parser.parse_args().repeat:
+        repeat()
+    else:
+        print(table_of_records(), end="")
+
+
 if __name__ == "__main__":
-    print(table_of_records(), end="")
+    main()

@@ -37,6 +37,7 @@ from pathlib import Path
 import numpy as np
 
 import phases
+import quasiharmonic
 from peers import PEERS
 from quasiharmonic import Descent, Problem, boundary_loops, io, is_injective, solve, surfaces
 from quasiharmonic.linsolve import available
@@ -233,8 +234,8 @@ def machine() -> str:
     if Path("/proc/cpuinfo").exists():
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), model)
-    versions = [f"Python {platform.python_version()}"]
-    for package in ("quasiharmonic", "numpy", "scipy", "mkl", "qdldl", "rslab", "libigl", "mouette"):
+    versions = [f"Python {platform.python_version()}", f"quasiharmonic {quasiharmonic.__version__}"]
+    for package in ("numpy", "scipy", "mkl", "qdldl", "rslab", "libigl", "mouette"):
         try:
             versions.append(f"{package} {version(package)}")
         except PackageNotFoundError:
@@ -349,25 +350,28 @@ def read_csv(path: Path) -> list[Record]:
     return records
 
 
-def draw(records: list[Record], path: Path) -> None:
+def draw(records: list[Record], path: Path, unit: str) -> None:
     """Plot seconds over triangles, both logarithmic: for each tool, the medians of the problems of a size."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(7, 5), layout="constrained")
+    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
     for tool in dict.fromkeys(record.tool for record in records):
         done = [record for record in records if record.tool == tool and record.seconds]
         groups = [[r for r in done if low <= r.triangles < high] for low, high in itertools.pairwise(_SIZES)]
         points = [
             (np.median([r.triangles for r in group]), np.median([r.median for r in group])) for group in groups if group
         ]
-        axes.loglog(*zip(*points, strict=True), ".-", label=tool, linewidth=2 if tool == OURS else 1.2)
-    axes.set(xlabel="triangles", ylabel="seconds")
+        label = f"{tool}: {'no' if all(record.injective for record in done) else 'some'} inverted triangles"
+        axes.loglog(*zip(*points, strict=True), label=label, linewidth=3 if tool == OURS else 1.5)
+    axes.set(xlabel="triangles", ylabel=unit)
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.grid(which="major", alpha=0.3)
     axes.legend(frameon=False)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=120)
     plt.close(figure)
 
 
@@ -438,7 +442,7 @@ def main(arguments: list[str] | None = None) -> None:
         times = ", ".join(f"{record.tool} {_time(record)}" for record in found) or "every tool has exceeded the limit"
         print(f"{name}, {len(arrays[1])} triangles: {times}", flush=True)
     frames += animation(20_000) if options.animation else []
-    text = f"{machine()}{'; seconds of the processor' if options.processor else ''}\n"
+    text = f"{machine()}{'; CPU seconds' if options.processor else ''}\n"
     if records:
         text += f"\n{table(records)}"
         print(f"\nTime of quasiharmonic by phase, in percent:\n\n{phase_table(records)}")
@@ -453,7 +457,7 @@ def main(arguments: list[str] | None = None) -> None:
     write_csv(records + frames, options.output / "speed.csv")
     (options.output / "summary.md").write_text(f"{machine()}\n\n{size_table(records)}", encoding="utf-8")
     if records:
-        draw(records, options.output / "speed.png")
+        draw(records, options.output / "speed.png", "CPU seconds" if options.processor else "seconds")
 
 
 if __name__ == "__main__":

@@ -89,9 +89,7 @@ def main() -> None:
     options = parser.parse_args()
     names = list(campaign.names(options.count, FEASIBLE))
     runs = {strategy: outcomes(names, strategy) for strategy in STRATEGIES}
-    text = (
-        "\n\n".join([f"% {machine()}", strategies(runs), *(stages(name, found) for name, found in runs.items())]) + "\n"
-    )
+    text = "\n\n".join([machine(), strategies(runs), *(stages(name, found) for name, found in runs.items())]) + "\n"
     print(text)
     if options.output:
         options.output.write_text(text, encoding="utf-8")

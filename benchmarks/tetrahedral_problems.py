@@ -1,6 +1,6 @@
 """Tetrahedra: maps onto a given boundary with a hidden injective map, and the certificate against an oracle.
 
-    python benchmarks/tetrahedral_problems.py problems -n 300
+    python benchmarks/tetrahedral_problems.py problems -n 300 [--table docs/mesh_motion/tetrahedra.md]
     python benchmarks/tetrahedral_problems.py certificate -n 20000   tiny meshes against an oracle in rational numbers
 
 A problem has a mesh and the boundary of a hidden map. Both are made from one mesh: the hidden map by a
@@ -25,6 +25,7 @@ from scipy.spatial import Delaunay
 
 from quasiharmonic import certify_tetrahedra, injective_tetrahedra
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from speed import machine
 
 FAMILIES = ("flow", "twist", "bend", "spin", "folded")
 #: Positions (n, 3) after a deformation of positions (n, 3) with a strength.
@@ -193,18 +194,21 @@ def run_problems(options: argparse.Namespace) -> None:
         print(json.dumps(row), file=sys.stderr, flush=True)
     if options.output:
         options.output.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    print("| family | problems | certified | inverted | at the start | median s | largest s |")
-    print("|---" * 7 + "|")
+    heads = "family", "problems", "certified", "inverted at rest", "inverted at the start", "median s", "largest s"
+    sizes = [row["tetrahedra"] for row in rows]
+    already = sum(row["at_start"] == 0 for row in rows)
+    about = f"{min(sizes):,} to {max(sizes):,} tetrahedra; in {already} problems the start is already valid"
+    lines = [f"{machine()}; {about}", "", f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for family in (*FAMILIES, None):
         some = [row for row in rows if family in (row["family"], None)]
         seconds = [row["seconds"] for row in some]
         line = [family or "all", len(some), sum(row["certified"] for row in some)]
         line += [f"{np.median([row[name] for row in some]):.0f}" for name in ("inverted", "at_start")]
         line += [f"{np.median(seconds):.2f}", f"{max(seconds):.1f}"]
-        print("| " + " | ".join(map(str, line)) + " |")
-    sizes = [row["tetrahedra"] for row in rows]
-    already = sum(row["at_start"] == 0 for row in rows)
-    print(f"\n{min(sizes)} to {max(sizes)} tetrahedra; in {already} problems the start is already valid.")
+        lines.append("| " + " | ".join(map(str, line)) + " |")
+    print("\n".join(lines))
+    if options.table:
+        options.table.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _count_inverted(T: IntArray, X: FloatArray) -> int:
@@ -228,6 +232,7 @@ def main() -> None:
     parser.add_argument("what", choices=runs)
     parser.add_argument("-n", "--count", type=int, default=300)
     parser.add_argument("-o", "--output", type=Path, help="file of JSON lines for the problems")
+    parser.add_argument("--table", type=Path, metavar="FILE", help="write the table of the problems here as well")
     options = parser.parse_args()
     runs[options.what](options)
 
