@@ -84,7 +84,7 @@ def store(picture: Path, folder: Path) -> Path:
     with Image.open(picture) as image:
         small = image.convert("RGB")
     small.thumbnail(SIZE, Image.Resampling.LANCZOS)
-    small.quantize(160).save(folder / picture.name, optimize=True)
+    small.quantize(200, Image.Quantize.MAXCOVERAGE, kmeans=3).save(folder / picture.name, optimize=True)
     return folder / picture.name
 
 
