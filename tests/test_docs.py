@@ -110,6 +110,22 @@ def test_outputs_may_be_abridged():
 
 
 DOCS = FOLDER / "docs"
+GUIDES = sorted([*DOCS.glob("howto/*.md"), *DOCS.glob("tutorials/*.md")])
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.stem)
+def test_guides_are_short(page):
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 250
+    assert [line for line in lines if len(line) > 100 and not line.startswith("|")] == []
+
+
+def test_most_guides_have_a_picture():
+    with_picture = {
+        page for page in GUIDES if re.search(r"^(```\{picture\}|!\[)", page.read_text("utf-8"), re.MULTILINE)
+    }
+    assert {page for page in GUIDES if page.parent.name == "tutorials" and page.stem != "index"} <= with_picture
+    assert len(with_picture) >= 15
 
 
 @pytest.fixture(scope="module")
