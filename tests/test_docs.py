@@ -120,6 +120,15 @@ def test_guides_are_short(page):
     assert [line for line in lines if len(line) > 100 and not line.startswith("|")] == []
 
 
+def test_pictures_import_only_what_the_package_requires():
+    for case in CASES:
+        (blocks,) = case.values
+        if any(block.kind == "{picture}" for block in blocks):
+            code = "\n".join(block.text for block in blocks if block.kind != "output")
+            imported = set(re.findall(r"^(?:from|import) (\w+)", code, re.MULTILINE))
+            assert imported <= {"quasiharmonic", "numpy", "matplotlib"} | sys.stdlib_module_names, case.id
+
+
 def test_most_guides_have_a_picture():
     with_picture = {
         page for page in GUIDES if re.search(r"^(```\{picture\}|!\[)", page.read_text("utf-8"), re.MULTILINE)
