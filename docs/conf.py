@@ -33,6 +33,7 @@ extensions = [
     "commands",
     "mathml",
     "names",
+    "page_examples",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = [

@@ -1,8 +1,6 @@
 """Run every Python block of the pages, and the commands of the README and the tutorials.
 
-The blocks of a section, and all blocks of a tutorial, share their names.
-
-A comment `# prints …` after a `print` states its output, and the test compares it.
+Every print of a page has its output: `docs/_ext/page_examples.py` describes how a page shows it.
 """
 
 from __future__ import annotations
@@ -11,6 +9,7 @@ import csv
 import re
 import shlex
 import shutil
+import sys
 import warnings
 from contextlib import chdir
 from importlib import import_module
@@ -27,45 +26,115 @@ FOLDER = Path(__file__).parent.parent
 PAGES = (FOLDER / "README.md", *sorted({*(FOLDER / "docs").rglob("*.md")} - {FOLDER / "docs/development/extending.md"}))
 
 
-def sections(page):
-    """Return title and code of each section with code; a tutorial is one section."""
-    found = [(page.name, [])]
-    # A line that begins with # is a comment in a block, and a heading outside.
-    for heading, language, code in re.findall(
-        r"^#+ ([^\n]*)$|^```([^\n]*)\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL
-    ):
-        if heading and page.parent.name != "tutorials":
-            found.append((heading, []))
-        elif language == "python":
-            found[-1][1].append(code)
-    return [(title, "\n".join(blocks)) for title, blocks in found if blocks]
-
+sys.path.append(str(FOLDER / "docs" / "_ext"))
+from page_examples import run, sections, store  # noqa: E402
 
 CASES = [
-    pytest.param(code, id=f"{page.relative_to(FOLDER)}: {title}") for page in PAGES for title, code in sections(page)
+    pytest.param(blocks, id=f"{page.relative_to(FOLDER)}: {title}")
+    for page in PAGES
+    for title, blocks in sections(page.read_text(encoding="utf-8"), whole=page.parent.name == "tutorials")
 ]
 
 
 OPTIONAL = "no dependency, not even of the tests: .ci/optional installs it"
 
 
+def unlike(blocks):
+    """Run a section, and return the prints that the page does not show as they are."""
+    lines = [block.text.split("\n") for block in blocks]
+    stated = {
+        (number, row): found[1]
+        for number, block in enumerate(lines)
+        for row, line in enumerate(block)
+        if (found := re.search(r"# prints (.*)$", line))
+    }
+    printed, rest = {}, [""] * len(blocks)
+
+    def record(number, row, text):
+        if (number, row) not in stated:
+            rest[number] += f"{text}\n"
+        elif text != stated[number, row]:
+            wrong.append((text, stated[number, row]))
+        printed[number, row] = text
+
+    wrong = []
+    run(blocks, record)
+    wrong += [("", text) for place, text in stated.items() if place not in printed]
+    for number, text in enumerate(rest):
+        after = blocks[number + 1 : number + 2]
+        shown = after[0].text if after and after[0].kind == "output" else ""
+        if not re.fullmatch(re.escape(shown).replace("…", ".*"), text, re.DOTALL):
+            wrong.append((text, shown))
+    return wrong
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("code", CASES)
-def test_block_runs(code, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("blocks", CASES)
+def test_blocks_run_and_print_and_draw_what_the_page_shows(blocks, tmp_path, monkeypatch):
+    code = "\n".join(block.text for block in blocks)
     for name in ("SimpleITK", "nibabel", "nilearn", "skfem", "skimage", "datasets", "ray"):
         if re.search(rf"^(import|from) {name}\b", code, re.MULTILINE):
             pytest.importorskip(name, reason=OPTIONAL)
     if "import ray" in code:
         warnings.simplefilter("ignore")  # Ray uses its own deprecated options
     monkeypatch.chdir(tmp_path)
-    exec(compile(code, "block", "exec"), {"__name__": "block"})
-    printed = capsys.readouterr().out.splitlines()
-    assert [
-        line for line in re.findall(r"^ *print\(.*\)  # prints (.*)$", code, re.MULTILINE) if line not in printed
-    ] == []
+    assert unlike(blocks) == []
+    for block in blocks:
+        if block.kind == "{picture}":
+            name, alt = block.words.split(maxsplit=1)
+            assert alt
+            published = tmp_path / "published"
+            published.mkdir(exist_ok=True)
+            assert 2_000 < store(Path(name), published).stat().st_size < 80_000, name
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "```python\nprint(1)  # prints 2\n```\n",
+        "```python\nprint(1)\n```\n",
+        "```python\nprint(1)\n```\n\n```output\n2\n```\n",
+        "```python\nif 0:\n    print(1)  # prints 1\n```\n",
+    ],
+)
+def test_a_wrong_output_is_found(text):
+    ((_, blocks),) = sections(text, whole=True)
+    assert unlike(blocks)
+
+
+def test_outputs_may_be_abridged():
+    ((_, blocks),) = sections(
+        "```python\nfor i in range(9):\n    print(i)\n```\n\n```output\n0\n…\n8\n```\n", whole=True
+    )
+    assert unlike(blocks) == []
 
 
 DOCS = FOLDER / "docs"
+GUIDES = sorted([*DOCS.glob("howto/*.md"), *DOCS.glob("tutorials/*.md")])
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.stem)
+def test_guides_are_short(page):
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 250
+    assert [line for line in lines if len(line) > 100 and not line.startswith("|")] == []
+
+
+def test_pictures_import_only_what_the_package_requires():
+    for case in CASES:
+        (blocks,) = case.values
+        if any(block.kind == "{picture}" for block in blocks):
+            code = "\n".join(block.text for block in blocks if block.kind != "output")
+            imported = set(re.findall(r"^(?:from|import) (\w+)", code, re.MULTILINE))
+            assert imported <= {"quasiharmonic", "numpy", "matplotlib"} | sys.stdlib_module_names, case.id
+
+
+def test_most_guides_have_a_picture():
+    with_picture = {
+        page for page in GUIDES if re.search(r"^(```\{picture\}|!\[)", page.read_text("utf-8"), re.MULTILINE)
+    }
+    assert {page for page in GUIDES if page.parent.name == "tutorials" and page.stem != "index"} <= with_picture
+    assert len(with_picture) >= 15
 
 
 @pytest.fixture(scope="module")

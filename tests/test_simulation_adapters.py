@@ -174,7 +174,7 @@ def test_examples_for_libraries_in_the_documentation(library, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     if find_spec(library) is None or (library == "h5py" and find_spec("meshio") is None):
         pytest.skip(f"{library} is not installed; .ci/optional does it")
-    page = (Path(__file__).parent.parent / "docs" / "howto" / "simulation_meshes.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parent.parent / "docs" / "howto" / "simulation_libraries.md").read_text(encoding="utf-8")
     (code,) = re.findall(rf"^```py\n# {library}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     names = {}
     exec(compile(code, library, "exec"), names)
