@@ -63,6 +63,19 @@ class AirMeshState:
         The exact certificate of shapes and air together; there is no overlap if it is bijective.
     energy : float
         Mean elastic energy of the shapes.
+
+    See Also
+    --------
+    AirMesh : Its steps return it.
+
+    Examples
+    --------
+    >>> from quasiharmonic import AirMesh
+    >>> from quasiharmonic.surfaces import grid
+    >>> points, F = grid(2, 2)
+    >>> state = AirMesh(points, F, [[(-1, -1), (3, -1), (3, 3), (-1, 3)]]).moment
+    >>> bool(state.certificate.bijective), len(state.points)
+    (True, 13)
     """
 
     points: FloatArray
@@ -102,6 +115,20 @@ class AirMesh:
     ----------
     moment : AirMeshState
         The current state.
+
+    See Also
+    --------
+    MovingMesh : A mesh that follows its boundary.
+    results.AirMeshState : The state that every step returns.
+
+    Examples
+    --------
+    >>> from quasiharmonic import AirMesh
+    >>> from quasiharmonic.surfaces import grid
+    >>> points, F = grid(2, 2)
+    >>> air = AirMesh(points, F, [[(-1, -1), (3, -1), (3, 3), (-1, 3)]])
+    >>> bool(air.moment.certificate.bijective)
+    True
     """
 
     def __init__(

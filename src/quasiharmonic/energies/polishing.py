@@ -136,6 +136,13 @@ def polish(
     TimeoutError
         If the time limit is over before the first step.
 
+    See Also
+    --------
+    harmonise : Lowers energies that are no barriers.
+    flatten : Lowers the distortion with a free boundary.
+    distortion : Measures it.
+    quasiharmonic.atlas.polish : Every island of a mesh with seams.
+
     Examples
     --------
     >>> import numpy as np

@@ -197,6 +197,12 @@ def animate(problem: Problem, targets: Iterable[ArrayLike], **options: Unpack[An
         If a target has another size or a non-finite value (the message names the frame), an option is invalid, or
         ``max_motion_ratio`` is given without ``polish``.
 
+    See Also
+    --------
+    injective_map : One target.
+    injective_maps : Targets that do not depend on each other.
+    MovingMesh : Small steps of a simulation mesh.
+
     Examples
     --------
     Deform a disk into a star:

@@ -35,6 +35,19 @@ class MappedIsland(IslandReport):
         Whether the island is mirrored. If so, ``result`` belongs to its reflection about the v axis.
     result : MapResult
         The result, in the island's own numbering.
+
+    See Also
+    --------
+    atlas.MappedAtlas : Lists them as ``islands``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (island,) = atlas.flatten(atlas.SeamedMesh(V, F)).islands
+    >>> island.mirrored, island.result.status.name
+    (False, 'POLISHED')
     """
 
     result: MapResult
@@ -55,6 +68,20 @@ class MappedAtlas(Outcome):
     islands : tuple of MappedIsland
         Results in the order of each island's first triangle. After Ctrl-C the remaining islands are not listed and
         keep their positions.
+
+    See Also
+    --------
+    atlas.flatten, atlas.polish, atlas.harmonise, atlas.injective_map : Make it.
+    atlas.certify : The verdict on its mesh.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> mapped = atlas.flatten(atlas.SeamedMesh(V, F))
+    >>> mapped.status.name, mapped.mesh.uv.shape
+    ('POLISHED', (61, 2))
     """
 
     mesh: SeamedMesh

@@ -72,6 +72,21 @@ class BakeResult(BaseOutcome):
         Textures that could not be used, with the reason, and other parts of the look that are not baked.
     seconds : float
         Wall time of the call.
+
+    See Also
+    --------
+    bake : Makes it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import bake, io, unwrap
+    >>> from quasiharmonic.surfaces import starfish
+    >>> V, F = starfish(3, 4)
+    >>> old = io.MeshData(V, F, extra=np.tile([0.0, 0.0, 1.0], (len(V), 1)))
+    >>> result = bake(old, unwrap(V, F), size=64)
+    >>> result.success, result.colour.shape, result.problems
+    (True, (64, 64, 4), ())
     """
 
     mesh: MeshData
@@ -164,6 +179,11 @@ def bake(old: MeshOrPath, new: MeshOrPath | UnwrapResult, **options: Unpack[Bake
         triangles.
     quasiharmonic.io.MeshFileError
         If a file cannot be read.
+
+    See Also
+    --------
+    unwrap : Makes texture coordinates.
+    quasiharmonic.io.write_mapped : Writes the model with its textures.
 
     Examples
     --------

@@ -33,6 +33,19 @@ class InverseField:
     error : float
         Maximum distance of a pixel from itself after the inverse and the given field, in the field's unit; caused by
         rounding only.
+
+    See Also
+    --------
+    inverse_field : Makes it.
+    results.InverseVolume : The inverse on voxels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import inverse_field
+    >>> back = inverse_field(np.full((4, 4, 2), 1.0))
+    >>> back.field[2, 2].tolist(), bool(back.outside[0, 0])
+    ([-1.0, -1.0], True)
     """
 
     field: FloatArray
@@ -67,6 +80,11 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
     ValueError
         If the field folds, its border overlaps itself, it is not finite, or an argument has the wrong shape. The
         message names the pixels.
+
+    See Also
+    --------
+    nearest_invertible : Removes folds first.
+    InverseMap : The inverse of a map of a surface.
 
     Notes
     -----

@@ -73,6 +73,11 @@ def quasi_harmonic_derivative(
     quasiharmonic.linsolve.NotPositiveDefinite
         If rounding makes the Laplacian not positive definite.
 
+    See Also
+    --------
+    quasi_harmonic_map : The map alone.
+    polish_derivative, flatten_derivative : Derivatives of other maps.
+
     Notes
     -----
     The derivative uses the map's factor. All derivatives of one `Problem` share the memory of one factor, so
@@ -164,6 +169,11 @@ def polish_derivative(
     ------
     ValueError
         As `quasiharmonic.polish`. If ``uv`` is not injective, it has no derivative.
+
+    See Also
+    --------
+    polish : The map alone.
+    quasi_harmonic_derivative, flatten_derivative : Derivatives of other maps.
 
     Notes
     -----
@@ -287,6 +297,11 @@ def flatten_derivative(
     ------
     ValueError
         As `quasiharmonic.flatten`. If there are several surfaces, or ``uv`` is not injective.
+
+    See Also
+    --------
+    flatten : The map alone.
+    quasi_harmonic_derivative, polish_derivative : Derivatives of other maps.
 
     Examples
     --------

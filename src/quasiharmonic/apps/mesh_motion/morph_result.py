@@ -45,6 +45,20 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         square, 0 without area, negative if inverted.
     points_before : (n, 2) float64
         All nodes before the morph.
+
+    See Also
+    --------
+    morph : Makes it.
+    TetrahedraResult : The result for tetrahedra.
+
+    Examples
+    --------
+    >>> from quasiharmonic import morph
+    >>> from quasiharmonic.surfaces import grid
+    >>> points, F = grid(4, 4)
+    >>> morphed = morph(points, F, [24], [[1.2, 1.3]])
+    >>> morphed.success, morphed.points[24].tolist(), morphed.inverted.tolist()
+    (True, [1.2, 1.3], [])
     """
 
     points: FloatArray

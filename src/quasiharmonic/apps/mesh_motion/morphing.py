@@ -126,6 +126,12 @@ def morph(
         If the input is malformed (see `Problem`), a moved node is in no element, or the rest mesh overlaps itself. If
         an element at rest has no area, or a quadrilateral at rest is not convex. The message names the elements.
 
+    See Also
+    --------
+    MovingMesh : Many small steps.
+    injective_tetrahedra : Tetrahedra with any fixed vertices.
+    warp_by_landmarks : Images.
+
     Notes
     -----
     Tetrahedra are untangled by a regularised energy, then the energy is lowered further. The search can fail although a

@@ -51,6 +51,21 @@ class RepairedIsland(IslandReport):
         The obstruction to a map with this boundary, computed if triangles are still inverted.
     n_iterations : int
         Iterations of all searches and descents.
+
+    See Also
+    --------
+    RepairResult : Lists them as ``islands``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import repair
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> uv = V.copy()
+    >>> uv[0] = [0.4, 0.1]
+    >>> (island,) = repair(V, F, uv).islands
+    >>> len(island.inverted_before), len(island.inverted), island.moved_vertices.tolist()
+    (2, 0, [0])
     """
 
     inverted_before: IntArray
@@ -104,6 +119,20 @@ class RepairResult(SummarisedOutcome):
     mesh : SeamedMesh
         The surface with its new positions.
     seconds : float
+
+    See Also
+    --------
+    repair : Makes it.
+    results.RepairedIsland : The report of an island.
+
+    Examples
+    --------
+    >>> from quasiharmonic import repair
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> repaired = repair(V, F, V)
+    >>> repaired.success, len(repaired.islands), len(repaired.moved_vertices)
+    (True, 1, 0)
     """
 
     uv: FloatArray
@@ -232,6 +261,12 @@ def repair(
         If an array has the wrong shape or dtype, or indices are out of range.
     KeyboardInterrupt
         By Ctrl-C.
+
+    See Also
+    --------
+    injective_map : Maps the surface again.
+    inverted_triangles : Lists inverted triangles.
+    polish : Lowers the distortion afterwards.
 
     Examples
     --------

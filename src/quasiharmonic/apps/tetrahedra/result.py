@@ -29,7 +29,19 @@ _Vector = list[Fraction]
 
 
 class TetrahedraStatus(Enum):
-    """Why a search ended; the value is a message for the user."""
+    """Why a search ended; the value is a message for the user.
+
+    See Also
+    --------
+    TetrahedraResult : Has a status, and the message of it.
+    Status : The statuses of maps of triangles.
+
+    Examples
+    --------
+    >>> from quasiharmonic.apps.tetrahedra.result import TetrahedraStatus
+    >>> TetrahedraStatus.POLISHED.value
+    'Every tetrahedron is strictly positive, and the distortion has converged.'
+    """
 
     POLISHED = "Every tetrahedron is strictly positive, and the distortion has converged."
     STILL_FALLING = "Every tetrahedron is strictly positive. The distortion was still falling after the last iteration."
@@ -54,6 +66,20 @@ class TetrahedraObstruction:
     text : str
     vertices : tuple of int
         The vertices of the tetrahedron, edge or triangles, or the free vertex.
+
+    See Also
+    --------
+    TetrahedraResult : Lists them as ``obstructions``.
+    results.Obstruction : The same for triangles.
+
+    Examples
+    --------
+    >>> from quasiharmonic import injective_tetrahedra
+    >>> X = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    >>> reflected = [[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1]]
+    >>> result = injective_tetrahedra(X, [[0, 1, 2, 3]], range(4), reflected)
+    >>> result.obstructions[0].vertices
+    (0, 1, 2, 3)
     """
 
     text: str
@@ -88,6 +114,21 @@ class TetrahedraResult(Outcome, Displayable):
         `tetrahedron_quality` of every tetrahedron.
     points_before : (n, 3) float64
         All vertices before the morph.
+
+    See Also
+    --------
+    injective_tetrahedra, morph : Make it.
+    apps.tetrahedra.result.TetrahedraStatus : What each status means.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import injective_tetrahedra
+    >>> X = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.2, 0.2, 0.2]])
+    >>> T = [[0, 1, 2, 4], [0, 1, 3, 4], [0, 2, 3, 4], [1, 2, 3, 4]]
+    >>> result = injective_tetrahedra(X, T, range(4), 2.0 * X[:4])
+    >>> result.status.name, result.certificate.injective, bool(result.quality_after.min() > 0)
+    ('POLISHED', True, True)
     """
 
     points: FloatArray

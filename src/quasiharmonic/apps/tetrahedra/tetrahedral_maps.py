@@ -76,6 +76,11 @@ def injective_tetrahedra(
         If an argument is malformed or not finite, or a tetrahedron at rest is degenerate, repeated, or overlaps a
         neighbour. The message names the elements.
 
+    See Also
+    --------
+    morph : Moves some nodes of a mesh.
+    certify_tetrahedra : Checks a mesh.
+
     Notes
     -----
     The search can fail although a map exists. A boundary that crosses itself is reported before any search.

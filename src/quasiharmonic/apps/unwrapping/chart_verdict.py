@@ -42,6 +42,19 @@ class UnwrapCertificate(Verdict):
     clearance : float
         Smallest distance between two charts, in texels, in double precision; infinite if it exceeds the padding by
         more than half.
+
+    See Also
+    --------
+    unwrap : Makes it.
+    quasiharmonic.atlas.certify : The verdict on other texture coordinates.
+
+    Examples
+    --------
+    >>> from quasiharmonic import unwrap
+    >>> from quasiharmonic.surfaces import starfish
+    >>> certificate = unwrap(*starfish(3, 4)).certificate
+    >>> certificate.bijective, bool(certificate.bijective_charts.all()), certificate.clearance >= 4
+    (True, True, True)
     """
 
     bijective_charts: BoolArray

@@ -221,6 +221,13 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         lists, or cannot be kept. If the texture is too small for the padding of all charts, the message states the
         smallest sufficient resolution, or with ``faces`` a sufficient texel density.
 
+    See Also
+    --------
+    flatten : One surface with a boundary, without a texture.
+    bake : The look of the model for the new texture coordinates.
+    clean : The surfaces that a model with defects forms.
+    quasiharmonic.atlas.pack_charts : Places charts that exist.
+
     Examples
     --------
     >>> from quasiharmonic.surfaces import starfish

@@ -144,6 +144,12 @@ def harmonise(
         is a barrier and ``uv`` is not injective. If a user-defined energy or its first derivative is NaN or infinite
         at the start of a round. The message names the triangles.
 
+    See Also
+    --------
+    polish : Faster for barriers with second derivatives.
+    distortion : Measures the distortion.
+    quasiharmonic.atlas.harmonise : Every island of a mesh with seams.
+
     Examples
     --------
     Equalise the areas of a disk whose triangles are crowded at the centre:

@@ -230,6 +230,11 @@ def keep_distances(V: ArrayLike, F: ArrayLike, uv: ArrayLike, **options: Unpack[
         If the input is malformed (see `Problem`), the surface has handles, a rest triangle has no area, or ``uv`` is
         not bijective; the message names the elements.
 
+    See Also
+    --------
+    flatten : Makes the map, and with ``energy="distances"`` does both.
+    energies.distances.surface_distances : Samples distances.
+
     Examples
     --------
     A dome seen from above is compressed at its boundary; the descent spreads it out:
