@@ -47,14 +47,14 @@ class Status(Enum):
         "(refine=True; --refine), or move the target."
     )
     IMPOSSIBLE = (
-        "No such map exists for this mesh and this target. The diagnosis names the obstructions and how to remove "
-        "them. This is the best map found."
+        "No such map exists for this mesh and this target. This is the best map found. Remove the "
+        "obstructions that the diagnosis names."
     )
     OUT_OF_ITERATIONS = (
         "Some triangles were still inverted after the last iteration. "
         "The energy was still falling: allow more iterations."
     )
-    INTERRUPTED = "Interrupted. This is the best map so far."
+    INTERRUPTED = "Interrupted. This is the best map so far: use it as the initial map of a new call to continue."
     TIME_LIMIT = "The time limit ended the work. This is the best map so far: allow more time to improve it."
     ROUNDED = (
         "The map is injective in the solver's own coordinates, but its smallest triangles invert when the "
@@ -84,7 +84,7 @@ class Status(Enum):
     )
     UNIMPROVED = (
         "Every triangle is strictly positive, verified exactly, but the map is unchanged: no injective map with less "
-        "distortion was found. A smaller eta may help."
+        "distortion was found. Try a smaller eta or another energy."
     )
     PRECISION_LIMIT = (
         "A finer mesh has a map, but double precision cannot express it at the vertices listed: the target is too "
@@ -95,8 +95,8 @@ class Status(Enum):
         "mesh. Use fewer pins, or place them in the order of the mesh. This is the best map of the input mesh."
     )
     UNSOLVABLE = (
-        "No linear solver could factor the system. This is the best map so far. "
-        "Another linear solver or reference triangle may help."
+        "No linear solver could factor the system. This is the best map so far. Try another "
+        "linear_solver or another reference."
     )
 
     @property

@@ -241,6 +241,8 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
         """Return a text with the number of certified frames, the reasons for missing ones, and the largest move."""
         found, count = self.found, count_of("frame", "frames", len(self.frames))
         lines = [f"{count}: {np.count_nonzero(found)} with every triangle strictly positive, verified exactly"]
+        if not found.all():
+            lines[0] += "; change the targets of the others, or use fill_gaps=True"
         if self.interrupted:
             lines.append("interrupted before the last frame")
         if self.bridged.any():

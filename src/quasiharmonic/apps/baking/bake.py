@@ -118,6 +118,8 @@ class BakeResult(BaseOutcome):
                 f" {count_of('texel is', 'texels are', self.missing)} too far from the old model, and magenta: "
                 "raise max_distance, or check that both models are in the same place."
             )
+        if self.problems:
+            text += f" {count_of('problem', 'problems', len(self.problems))}: correct the old model as listed."
         return text
 
     def summary(self) -> str:

@@ -146,8 +146,10 @@ class InvertibleVolume(NearestField):
         left = int(np.count_nonzero(self.remaining))
         cells = f"{count_of('cell', 'cells', self.folds)} folded, {left} of them or their neighbours still do"
         moved = count_of("voxel", "voxels", int(np.count_nonzero(self.moved_mask)))
-        border = "" if self.bijective or left else " The surface of the grid crosses itself."
-        return f"{cells}; {moved} moved, root mean square change {self.distance:.3g}.{border}"
+        remedy = "" if self.bijective else " The surface of the grid crosses itself: fix the voxels there."
+        if left:
+            remedy = " Smooth the field there first, or fix fewer voxels."
+        return f"{cells}; {moved} moved, root mean square change {self.distance:.3g}.{remedy}"
 
 
 @dataclass(frozen=True, eq=False)

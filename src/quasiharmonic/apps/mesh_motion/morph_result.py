@@ -97,11 +97,14 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         qualities = self.describe_quality()
         if self.valid:
             return f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.\n{qualities}"
-        lines = [f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}."]
+        lines = [
+            f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}. Move the boundary less or in "
+            "several steps, and keep inner loops inside the outer loop."
+        ]
         if self.forbidden.size:
             lines.append(
-                f"Inverted for every position of the free nodes: {name_elements(self.F, self.forbidden)}. Move the "
-                "boundary less there, or split these elements."
+                f"Inverted for every position of the free nodes: {name_elements(self.F, self.forbidden)}. Split "
+                "these elements, or move their nodes less."
             )
         if not self.result.injective:
             lines.append(self.result.status.value)

@@ -181,6 +181,8 @@ class RepairResult(SummarisedOutcome):
             f"{count_of('triangle', 'triangles', before)} inverted before, {now} now; "
             f"{count_of('vertex', 'vertices', len(self.moved_vertices))} moved"
         ]
+        if now:
+            lines[0] += "; move the boundary of the islands listed, or flatten these islands again"
         return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size or i.mirrored])
 
     def _count_inverted(self) -> tuple[int, int]:
@@ -329,5 +331,7 @@ def _report_mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIs
         moved_vertices=np.unique(island.vertices) if turn else none,
         mirrored=True,
         bijective=bool(certificate.bijective),
-        reason="Double precision cannot express it the other way around." if wrong.size else "",
+        reason="Double precision cannot express its reflection. Move the map nearer to the origin."
+        if wrong.size
+        else "",
     )

@@ -29,7 +29,7 @@ _Vector = list[Fraction]
 
 
 class TetrahedraStatus(Enum):
-    """Why a search ended; the value is a message for the user.
+    """Why a search ended; the value is a message for the user with the outcome and the next action.
 
     See Also
     --------
@@ -44,17 +44,30 @@ class TetrahedraStatus(Enum):
     """
 
     POLISHED = "Every tetrahedron is strictly positive, and the distortion has converged."
-    STILL_FALLING = "Every tetrahedron is strictly positive. The distortion was still falling after the last iteration."
+    STILL_FALLING = (
+        "Every tetrahedron is strictly positive. The distortion was still falling after the last iteration: "
+        "allow more iterations to lower it further."
+    )
     FIRST_VALID = "Every tetrahedron is strictly positive."
     STALLED = (
         "Stalled: some tetrahedra are still inverted and further iterations do not help. No known obstruction forbids "
-        "a valid mesh, but this mesh and this target may still allow none."
+        "a valid mesh, but this mesh and this target may still allow none. Move the boundary less, move it in several "
+        "steps, or split the edges of the inverted tetrahedra."
     )
     OUT_OF_ITERATIONS = "Some tetrahedra were still inverted after the last iteration: allow more iterations."
-    OVERLAPPING = "Every tetrahedron is strictly positive, but the mesh overlaps itself: points are covered twice."
-    INTERRUPTED = "Interrupted. This is the best mesh so far."
-    IMPOSSIBLE = "No valid mesh with these fixed vertices exists. The obstructions are listed."
-    CROSSING = "The boundary crosses itself at its target positions, so no valid mesh exists. Nothing was computed."
+    OVERLAPPING = (
+        "Every tetrahedron is strictly positive, but the mesh overlaps itself: points are covered twice. Move apart "
+        "the parts of the boundary that the certificate lists."
+    )
+    INTERRUPTED = "Interrupted. This is the best mesh so far: use it as the initial mesh of a new call to continue."
+    IMPOSSIBLE = (
+        "No valid mesh with these fixed vertices exists. Move the vertices that the obstructions list, or split the "
+        "edges there."
+    )
+    CROSSING = (
+        "The boundary crosses itself at its target positions, so no valid mesh exists, and nothing was computed. Move "
+        "apart the triangles that the obstructions list."
+    )
 
 
 @dataclass(frozen=True)
