@@ -267,7 +267,10 @@ def one_of(*words: str | None) -> Check:
 
     def check(name: str, value: Any) -> None:
         if not isinstance(value, str | None) or value not in words:
-            raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {value!r}")
+            raise ValueError(
+                f"{name} must be one of {', '.join(map(str, words))}, not {value!r}"
+                f"{suggest(value, [word for word in words if word])}"
+            )
 
     return check
 

@@ -364,7 +364,7 @@ class InverseMap(ReadOnly):
 def _check(certificate: Certificate, overlapping: bool) -> None:
     """Raise ValueError if the map has no inverse."""
     if not certificate.injective:
-        raise ValueError(f"this map has no inverse. {certificate.summary()}")
+        raise ValueError(f"this map has no inverse. {certificate.summary()} Repair it first (repair; qhm repair).")
     if not (certificate.bijective or overlapping):
         raise ValueError(
             f"this map has no inverse. {certificate.summary()} "

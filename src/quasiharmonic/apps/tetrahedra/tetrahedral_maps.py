@@ -103,8 +103,15 @@ def injective_tetrahedra(
 
 
 def is_volume(points: ArrayLike, cells: ArrayLike) -> bool:
-    """Whether points are in space, and cells are not triangles."""
-    return np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(cells) == 2 and np.shape(cells)[1] != 3
+    """Whether points are in space, and cells are not triangles; ValueError for triangles in space."""
+    if np.ndim(points) != 2 or np.shape(points)[1] != 3 or np.ndim(cells) != 2:
+        return False
+    if np.shape(cells)[1] == 3:
+        raise ValueError(
+            f"points must have shape (n, 2) for triangles, not {np.shape(points)}: for a planar mesh pass "
+            "points[:, :2]; tetrahedra need F of shape (f, 4)"
+        )
+    return True
 
 
 def morph_tetrahedra(

@@ -300,7 +300,7 @@ def surface_edges(F: IntArray, n: int) -> Edges:
         first = np.unique(label)
         raise ValueError(
             f"the mesh has {first.size} components, the first ones around {vertex_names(first)}: "
-            "map each component separately"
+            "map each component separately; if vertices at equal positions belong together, weld them first with clean"
         )
     return found
 
@@ -331,8 +331,12 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
 def _check_triangles(F: IntArray) -> None:
     collapsed = np.flatnonzero(are_collapsed(F))
     if collapsed.size:
-        raise ValueError(f"{triangle_names(collapsed)}: a vertex is used twice in a triangle")
+        raise ValueError(
+            f"{triangle_names(collapsed)}: a vertex is used twice in a triangle; remove such triangles with clean"
+        )
 
     repeats = np.flatnonzero(find_twins(F) < np.arange(len(F)))
     if repeats.size:
-        raise ValueError(f"{triangle_names(repeats)} repeated: the same three vertices occur before")
+        raise ValueError(
+            f"{triangle_names(repeats)} repeated: the same three vertices occur before; remove repetitions with clean"
+        )

@@ -61,7 +61,10 @@ class Kind(Enum):
     INVERTED_PATCH = "Split the fixed edges around the patch, or move their vertices."
     SIGNED_AREA = "Reflect the target or reverse its loops until it winds counterclockwise around the mesh."
     HALF_PLANES = "Split the edges between the vertex and the edges it should lie to the left of."
-    REVERSED = "Reverse the winding of the triangles, F[:, ::-1], or reflect the target."
+    REVERSED = (
+        "Check that fixed and target are in the same order, and try target[::-1]. Otherwise reverse the winding of the "
+        "triangles, F[:, ::-1], or reflect the target."
+    )
     TURNING_NUMBER = "Untwist the target: reverse or move the loops until their turning numbers add up."
     NEGATIVE_WINDING = "Untwist the target, or move the loops so that holes lie inside and run clockwise."
     GENUS = "Cut the handles of the surface open."

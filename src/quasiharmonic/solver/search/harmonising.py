@@ -37,6 +37,7 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.options import HarmoniseOptions, takes
 from quasiharmonic.util.progress import reports_progress
+from quasiharmonic.util.spelling import suggest
 
 
 def _without_mesh(energy: Energy) -> Callable[[FloatArray, IntArray], Energy]:
@@ -191,7 +192,7 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
     if barrier and inverted.size:
         raise ValueError(
             f"uv is not injective: {names_of('triangle', 'triangles', inverted)} inverted or degenerate, where "
-            "this energy is infinite; start from an injective map, or lower R₁ (energy=None)"
+            "this energy is infinite; repair the map first (repair; qhm repair), or use an energy without a barrier"
         )
     name = options.energy if isinstance(options.energy, str) else "R₁" if chosen is None else type(chosen).__name__
     problem = Problem.on(domain, start[domain.fixed])
@@ -243,7 +244,10 @@ def _find_energy(energy: str | Energy | None, domain: Domain) -> Energy | None:
     if energy is None or isinstance(energy, Energy):
         return energy
     if not isinstance(energy, str) or energy not in ENERGIES:
-        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {describe(energy)}")
+        near = suggest(energy, ENERGIES)
+        raise ValueError(
+            f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {describe(energy)}{near}"
+        )
     return ENERGIES[energy](domain.V, domain.F)
 
 

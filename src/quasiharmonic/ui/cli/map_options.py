@@ -97,10 +97,9 @@ def surface(
     islands = len(found.mesh.islands)
     if islands > 1:
         found.facts["island_count"] = islands
-        found.notes.append(
-            f"{islands} islands, each mapped on its own"
-            + (" (use --seams none to map the surface as one island)" if options.seams != "none" else "")
-        )
+        joined = options.seams != "none" and len(SeamedMesh(mesh.V, mesh.F).islands) < islands
+        advice = "use --seams none to map the surface without seams" if joined else "qhm check lists vertices to weld"
+        found.notes.append(f"{islands} islands, each mapped on its own ({advice})")
     return found
 
 
