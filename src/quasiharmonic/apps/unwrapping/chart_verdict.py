@@ -143,7 +143,7 @@ def certify_charts(
         inverted=np.sort(triangles[whole.inverted]),
         degenerate=np.sort(triangles[np.concatenate([whole.degenerate, whole.nonfinite])]),
         overlapping=overlapping,
-        clearance=_clearance(whole.loops, uv * size, chart_of_vertex, 1.5 * padding),
+        clearance=measure_clearance(whole.loops, uv * size, chart_of_vertex, 1.5 * padding),
     )
 
 
@@ -184,7 +184,7 @@ def _find_faults(
     return good, np.array(sound, dtype=np.int64).reshape(-1, 2)
 
 
-def _clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vertex: IntArray, reach: float) -> float:
+def measure_clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vertex: IntArray, reach: float) -> float:
     """Return the smallest distance between boundaries of different charts; infinity if it exceeds ``reach``."""
     if len(loops) < 2:
         return np.inf

@@ -40,6 +40,7 @@ from quasiharmonic.ui.cli.arguments import (
     texture_size,
     weld,
 )
+from quasiharmonic.util.optional import with_extra
 from quasiharmonic.util.options import INSTANCES, BakeOptions, UnwrapOptions
 
 if TYPE_CHECKING:
@@ -327,7 +328,7 @@ def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) 
     from quasiharmonic.ui.batch.supervisor import resident
 
     if resident(os.getpid()) is None:
-        raise ValueError("--memory needs psutil on this system: pip install psutil")
+        raise ValueError(f"--memory needs psutil on this system: pip install {with_extra('batch')}")
 
     def check(step: UnwrapStep) -> None:
         used = resident(os.getpid())
