@@ -16,9 +16,11 @@ from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
 from quasiharmonic.io.adapters.objects import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, find_exponent, names_of
+from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Outcome
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from trimesh import Trimesh
 
     from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
@@ -157,7 +159,7 @@ class UnwrapStep(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class UnwrapResult(Outcome):
+class UnwrapResult(Outcome, Displayable):
     """Texture coordinates of a model, made by `unwrap`; iterates as ``vmapping, indices, uvs``.
 
     Attributes
@@ -287,6 +289,20 @@ class UnwrapResult(Outcome):
         material and its metadata are kept.
         """
         return make_trimesh(self.V[self.vmapping], self.indices, self.uvs, like=self.source, rows=self.vmapping)
+
+    def plot(self) -> Figure:
+        """Draw the charts, and the model with a checkerboard, the stretch and the texel density.
+
+        Returns
+        -------
+        matplotlib Figure
+            Triangles whose orientation differs from that of their chart are red.
+        """
+        return self._draw("unwrap")
+
+    def short_repr(self) -> str:
+        """Return the outcome in a sentence."""
+        return self.message
 
     def summary(self) -> str:
         """Return charts, seams, stretch and utilisation in a few lines."""
