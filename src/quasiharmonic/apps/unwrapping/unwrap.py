@@ -112,8 +112,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Any triangles. Degenerate and repeated triangles get the texture coordinates of a neighbour. Surfaces are cut at
         edges of three or more triangles and where they cannot be oriented; see `clean`.
     max_stretch : float
-        Bound on the stretch max(σ₁, 1/σ₂), at least 1. 99 % of the surface keep it. No triangle is stretched by more
-        than 3, except triangles with an angle below 1°. Lower values need more seams.
+        Bound on the stretch max(σ₁, 1/σ₂) at 99 % of the surface, at least 1. No triangle may be stretched by more than
+        3, except triangles with an angle below 1°. Lower values need more seams. `UnwrapResult.misses` lists the charts
+        that exceed the bound.
     max_charts : int, optional
         Maximum number of charts. It is exceeded only by connected parts, and by parts that have no bijective map
         otherwise.

@@ -62,7 +62,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
     add_options(
         parser,
         fixed=file(
-            "file of fixed vertices, 0-based, one per line (default: the boundary; with --slide none but the corners)"
+            "file of fixed vertices, 0-based, one per line (default: the boundary; with --slide only the corners)"
         ),
         **declare_options(PolishOptions),
         free=flag("free the boundary; each island stays near its position"),
