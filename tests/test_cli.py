@@ -268,7 +268,7 @@ def test_help_names_what_an_option_takes(capsys):
     for command, parts in (
         ("morph", ["MESH\n", "-o MESH, --output MESH"]),
         ("flatten", ["-o OUTPUT, --output OUTPUT", "--time-limit SECONDS"]),
-        ("batch", ["for --to: boundary vertices", "for --to: how far"]),
+        ("batch", ["for --to: boundary vertices", "for --to: minimum turn"]),
     ):
         with pytest.raises(SystemExit):
             run(command, "--help")

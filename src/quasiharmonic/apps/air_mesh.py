@@ -145,7 +145,7 @@ class AirMesh:
         idle = np.setdiff1d(np.arange(len(self._rest)), self._F)
         reject(idle, "vertex", "vertices", "no triangle uses {}: remove unused vertices")
         turned = orientation(*(self._rest[self._F[:, k]] for k in range(3))) <= 0
-        reject(turned, "triangle", "triangles", "{} not counterclockwise")
+        reject(turned, "triangle", "triangles", "{} not counterclockwise: reverse the order of their corners")
         check_numbers(air_weight=air_weight)
         if not 0 < air_weight <= 1:
             raise ValueError(f"air_weight must be above 0 and at most 1, not {air_weight}")

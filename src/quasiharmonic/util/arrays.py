@@ -339,7 +339,8 @@ def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
     """Raise a ValueError that names the first rows with NaN or infinite numbers; ``one``, ``many`` name a row."""
     finite = np.isfinite(rows)
     if not finite.all():
-        raise ValueError(f"{name} is not finite at {names_of(one, many, np.flatnonzero(~finite.all(axis=1)))}")
+        which = names_of(one, many, np.flatnonzero(~finite.all(axis=1)))
+        raise ValueError(f"{name} is not finite at {which}: give finite numbers")
 
 
 def reject(found: BoolArray | IntArray, one: str, many: str, message: str) -> None:

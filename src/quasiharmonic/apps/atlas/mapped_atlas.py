@@ -187,7 +187,7 @@ def check_island_choice(mesh: SeamedMesh, only: Collection[int] | None) -> Colle
         return range(count)
     absent = np.setdiff1d(list(only), np.arange(count))
     if not only:
-        raise ValueError("no island is chosen")
+        raise ValueError("no island is chosen: name at least one")
     if absent.size:
         raise ValueError(f"there is no {names_of('island', 'islands', absent)}: the mesh has {count}, from 0")
     bare = np.array([k for k, island in enumerate(mesh.islands) if k not in only and np.isnan(island.uv).any()])

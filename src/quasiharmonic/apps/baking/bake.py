@@ -254,7 +254,9 @@ class _Baker:
         for axis in range(2):
             outside |= (uv[:, :, axis].max(axis=1) < 0) | (uv[:, :, axis].min(axis=1) > 1)
         if (outside | bare).all():
-            raise ValueError("the new model has no texture coordinates in the unit square")
+            raise ValueError(
+                "the new model has no texture coordinates in the unit square: move them there, or unwrap it again"
+            )
         if outside.any():
             count = count_of("triangle is", "triangles are", int(outside.sum()))
             self.problems.append(f"{count} outside the unit square of the new texture coordinates, and not baked")

@@ -108,7 +108,7 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
     positions, F = grid.positions(given).reshape(-1, 2), grid.triangles()
     certificate = certify(F, positions)
     if not certificate.bijective:
-        raise ValueError(f"the field has no inverse. {certificate.summary()}")
+        raise ValueError(f"the field has no inverse. {certificate.summary()} Change the displacements at the border.")
     pixels = grid.points.reshape(-1, 2)
     triangle = PointLocator(positions[F]).find(pixels)
     found = np.flatnonzero(triangle >= 0)

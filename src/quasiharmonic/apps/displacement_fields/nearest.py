@@ -223,7 +223,9 @@ def nearest_invertible(
         positions = np.stack([here.real, here.imag], axis=-1) * grid.unit
         repaired[moved] = (positions - grid.points)[moved]
         if not is_fold_free(grid, repaired).all():
-            raise RuntimeError("rounding folds the new field: its displacements are too large for its spacing")
+            raise RuntimeError(
+                "rounding folds the new field: its displacements are too large for its spacing; scale them down"
+            )
     certificate = certify(grid.triangles(), grid.positions(repaired).reshape(-1, 2))
     return InvertibleField.of(given, repaired, wrong, began, certificate=certificate)
 

@@ -369,7 +369,9 @@ def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
     grid, given, exponent = in_units(check_field(field), spacing)
     check_unfolded(find_folded_cells(grid, given, None))
     if _surface_crosses(grid, given):
-        raise ValueError("the field has no inverse: the surface of the grid crosses itself")
+        raise ValueError(
+            "the field has no inverse: the surface of the grid crosses itself; change the displacements there"
+        )
     back = np.full((int(np.prod(grid.shape)), 3), np.nan)
     best = np.full(len(back), -np.inf)
     X = (grid.positions(given) / grid.spacing).reshape(-1, 3)

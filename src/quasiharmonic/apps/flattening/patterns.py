@@ -100,7 +100,10 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
     positions = map_array("uv", uv)
     certificate = certify(F, positions)
     if not certificate.bijective:
-        raise ValueError(f"the map overlaps itself, so its pattern cannot be cut out. {certificate.summary()}")
+        raise ValueError(
+            f"the map overlaps itself, so its pattern cannot be cut out. {certificate.summary()} Flatten the surface "
+            f"again."
+        )
     with np.errstate(over="ignore"):
         seam = [positions[loop] * UNITS[unit] for loop in certificate.loops]
     if not all(np.isfinite(line).all() for line in seam):

@@ -323,7 +323,7 @@ def _find_fixed(
     positions = map_array("target", target, len(given), finite=False)
     check_finite("target", "row", "rows", positions)
     idle = given[~np.isin(given, F)]
-    reject(idle, "vertex", "vertices", "moved_vertices refers to {}, but no triangle uses them")
+    reject(idle, "vertex", "vertices", "moved_vertices refers to {}, but no triangle uses them: omit them")
     left = np.setdiff1d(boundary_edges(covering_triangles(F)[0], len(points)), given)
     there = points.copy()
     there[given] = positions

@@ -143,7 +143,7 @@ def find_fixed(
 ) -> tuple[IntArray, IntArray, Sliding]:
     """Return the moved vertices, checked, the boundary vertices that neither move nor slide, and those that slide."""
     moved = vertex_indices("moved_vertices", moved_vertices, len(points))
-    reject(np.bincount(moved) > 1, "vertex", "vertices", "{} moved more than once")
+    reject(np.bincount(moved) > 1, "vertex", "vertices", "{} moved more than once: list each vertex once")
     idle = moved[~np.isin(moved, mesh.T)]
     reject(idle, "vertex", "vertices", "moved_vertices refers to {}, in no tetrahedron")
     sliding = find_sliding(mesh.faces.boundary, points, moved, slide)

@@ -168,7 +168,9 @@ def warp_by_landmarks(
     if interrupted and not result.injective:
         raise KeyboardInterrupt
     if result.certificate.crossings.size:
-        raise ValueError("target: the border, moved by the landmarks on it, crosses itself")
+        raise ValueError(
+            "target: the border, moved by the landmarks on it, crosses itself: move them less, or keep their order"
+        )
     if not result.injective:
         raise RuntimeError(
             "no warp without folds was found: landmarks may move too far past each other or past the border. "

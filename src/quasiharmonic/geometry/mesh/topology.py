@@ -203,7 +203,9 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
                 "inspect_mesh (qhm check) lists defects, and vertices at equal positions that may need to be merged"
             )
         unpaired = np.setxor1d(tails, heads)
-        raise ValueError(f"the boundary does not close at {vertex_names(unpaired)}")
+        raise ValueError(
+            f"the boundary does not close at {vertex_names(unpaired)}; orient all triangles alike with clean"
+        )
     return np.split(vertices, np.cumsum(lengths[: number - 1])) if number > 1 else [vertices][:number]
 
 

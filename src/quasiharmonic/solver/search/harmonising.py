@@ -199,7 +199,10 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
     with problem.exclusive() as own, np.errstate(all="ignore"):
         area = float(signed_areas(own.F, own.frame.inward(start)).sum())
         if not area > 0:
-            raise ValueError("the boundary encloses no area in uv, or has the wrong orientation")
+            raise ValueError(
+                "the boundary encloses no area in uv, or has the wrong orientation: reflect uv, or map the boundary "
+                "again"
+            )
         deformation = None
         if chosen is not None:
             # The map is in the frame's unit. Scale the surface accordingly so that both compare as in the caller's

@@ -348,7 +348,7 @@ def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArr
     points, wanted = vertex_array(V), vertex_array(places, "places")
     loops = boundary_loops(triangle_array(F, len(points)), len(points))
     if not loops:
-        raise ValueError("the surface is closed: it has no boundary vertices")
+        raise ValueError("the surface is closed: it has no boundary vertices; cut it open first (cut_open; --cut)")
     border = np.sort(np.concatenate(loops))
     both = scale_to_unit(np.concatenate([pad_to_space(points[border]), pad_to_space(wanted)]))
     here, there = both[: len(border)], both[len(border) :]

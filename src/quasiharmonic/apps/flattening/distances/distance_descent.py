@@ -258,7 +258,9 @@ def keep_distances(V: ArrayLike, F: ArrayLike, uv: ArrayLike, **options: Unpack[
     positions = map_array("uv", uv, n)
     certificate = certify(piece.F, positions, loops=piece.loops)
     if not certificate.bijective:
-        raise ValueError(f"uv is not bijective: the descent needs a bijective map. {certificate.summary()}")
+        raise ValueError(
+            f"uv is not bijective: the descent needs a bijective map. {certificate.summary()} Make one with flatten."
+        )
     result = MapResult(uv=positions, status=Status.INTERRUPTED, certificate=certificate)
     with Run().until_interrupted():
         lowered = lower_distance_error(piece, positions, checked)

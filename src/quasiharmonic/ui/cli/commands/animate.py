@@ -185,7 +185,9 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
             mapped = io.mapped(frame)
         opened = mapped.opened()
         if opened.uv is None or not mapped.seamless:
-            raise ValueError(f"{path}: its map has seams, which frames do not support")
+            raise ValueError(
+                f"{path}: its map has seams, which frames do not support: map it without (qhm map --seams none)"
+            )
         positions.append(opened.uv[fixed])
     return np.stack(positions)
 
