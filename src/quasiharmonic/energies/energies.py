@@ -125,7 +125,9 @@ class Energy(ABC):
 
     See Also
     --------
-    polish, harmonise, flatten : Take an energy.
+    polish : Takes an energy.
+    harmonise : Takes an energy.
+    flatten : Takes an energy.
     quasiharmonic.energies.energies : The energies with a name.
 
     Examples

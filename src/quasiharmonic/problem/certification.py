@@ -61,7 +61,8 @@ def certify(
 
     See Also
     --------
-    is_injective, inverted_triangles : Check the triangles only, for inner loops.
+    is_injective : Checks the triangles only.
+    inverted_triangles : Checks the triangles only.
     certify_tetrahedra : Checks tetrahedra.
     quasiharmonic.atlas.certify : Checks a map with seams.
 

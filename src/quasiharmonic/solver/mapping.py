@@ -127,7 +127,7 @@ def injective_map(
     --------
     flatten : If the boundary may move.
     injective_maps : Many small problems, several times as fast.
-    polish : Lower the distortion of the map.
+    polish : Lowers the distortion of the map.
     diagnose : Why there is no map.
 
     Examples

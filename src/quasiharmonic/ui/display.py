@@ -126,7 +126,7 @@ def _picture(shown: Displayable) -> str:
     if count == 0:
         return ""
     if count > MAX_TRIANGLES:
-        return f"<em>{count:,} triangles are drawn when asked for: .plot()</em>"
+        return f"<em>{count:,} triangles: call .plot() to draw them</em>"
     try:
         data = b64encode(_png(draw(shown, "map"))).decode()
     except (ValueError, ImportError) as error:

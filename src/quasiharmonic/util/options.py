@@ -319,7 +319,7 @@ class HarmoniseOptions(SolverOptions):
     conformal: float = option(1e-3, check=tolerance)
     weights: Any = option(None)
     scaled: bool = option(True, check=switch)
-    max_iterations: int = option(40, "linear solves per round (default: 40)", check=positive)
+    max_iterations: int = option(40, "maximum number of linear solves per round (default: 40)", check=positive)
     tol: float = option(1e-3, check=tolerance)
     reference: str = option("rest", check=reference_name)
 

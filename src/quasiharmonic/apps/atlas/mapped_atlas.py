@@ -71,7 +71,10 @@ class MappedAtlas(Outcome):
 
     See Also
     --------
-    atlas.flatten, atlas.polish, atlas.harmonise, atlas.injective_map : Make it.
+    atlas.flatten : Makes it.
+    atlas.polish : Makes it.
+    atlas.harmonise : Makes it.
+    atlas.injective_map : Makes it.
     atlas.certify : The verdict on its mesh.
 
     Examples

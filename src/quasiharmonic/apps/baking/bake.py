@@ -65,7 +65,7 @@ class BakeResult(BaseOutcome):
     covered : int
         Number of texels whose centre, or one of whose samples, is in a triangle.
     missing : int
-        Number of these that are too far from the old model. They have the colour `MISSING`, magenta.
+        Number of covered texels that are too far from the old model. They have the colour `MISSING`, magenta.
     same_mesh : bool
         Whether both models have the same triangles, so that points correspond exactly.
     problems : tuple of str

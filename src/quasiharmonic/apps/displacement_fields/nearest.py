@@ -259,7 +259,7 @@ def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0, interpolation: str 
             return np.asarray(least_coefficients(volume, scaled) > 0)
         return ~find_folded_cells(volume, scaled, None)
     if interpolation != "linear":
-        raise ValueError("trilinear interpolation is that of volumes: omit interpolation")
+        raise ValueError("trilinear interpolation applies only to volumes: omit interpolation")
     given = check_field(field)
     return is_fold_free(PixelGrid(given.shape[:2], spacing), given)
 

@@ -167,7 +167,7 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
     See Also
     --------
     injective_map : If the boundary has target positions.
-    keep_distances : Lower the error of distances further.
+    keep_distances : Lowers the error of distances further.
     unwrap : Any model, closed or with defects, into a texture.
     quasiharmonic.atlas.flatten : Every island of a mesh with seams.
 

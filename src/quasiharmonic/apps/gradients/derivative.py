@@ -205,7 +205,9 @@ class Derivative:
 
     See Also
     --------
-    quasi_harmonic_derivative, polish_derivative, flatten_derivative : Make it.
+    quasi_harmonic_derivative : Makes it.
+    polish_derivative : Makes it.
+    flatten_derivative : Makes it.
     apps.gradients.Gradients : What `vjp` returns.
 
     Examples

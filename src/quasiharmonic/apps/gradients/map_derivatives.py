@@ -76,7 +76,8 @@ def quasi_harmonic_derivative(
     See Also
     --------
     quasi_harmonic_map : The map alone.
-    polish_derivative, flatten_derivative : Derivatives of other maps.
+    polish_derivative : The derivative of another map.
+    flatten_derivative : The derivative of another map.
 
     Notes
     -----
@@ -90,7 +91,7 @@ def quasi_harmonic_derivative(
     >>> V, F = disk(6)
     >>> rim = np.arange(len(V) - 36, len(V))
     >>> derivative = quasi_harmonic_derivative(Problem(V, F, rim, V[rim]))
-    >>> shifted = derivative.jvp(target=np.tile([1.0, 0.0], (36, 1)))  # the boundary moves, and everything with it
+    >>> shifted = derivative.jvp(target=np.tile([1.0, 0.0], (36, 1)))  # the whole map moves with its boundary
     >>> bool(np.allclose(shifted, [1, 0]))
     True
     """
@@ -173,7 +174,8 @@ def polish_derivative(
     See Also
     --------
     polish : The map alone.
-    quasi_harmonic_derivative, flatten_derivative : Derivatives of other maps.
+    quasi_harmonic_derivative : The derivative of another map.
+    flatten_derivative : The derivative of another map.
 
     Notes
     -----
@@ -194,7 +196,7 @@ def polish_derivative(
     >>> V, F = disk(6)
     >>> rim = np.arange(len(V) - 36, len(V))
     >>> derivative = polish_derivative(V, F, polish(V, F, V, fixed=rim).uv, fixed=rim)
-    >>> gradients = derivative.vjp(derivative.uv)  # of half the sum of the squares of all places
+    >>> gradients = derivative.vjp(derivative.uv)  # of half the sum of the squares of all positions
     >>> gradients.target.shape, gradients.rest.shape, derivative.reliable
     ((36, 2), (127, 2), True)
     """
@@ -301,7 +303,8 @@ def flatten_derivative(
     See Also
     --------
     flatten : The map alone.
-    quasi_harmonic_derivative, polish_derivative : Derivatives of other maps.
+    quasi_harmonic_derivative : The derivative of another map.
+    polish_derivative : The derivative of another map.
 
     Examples
     --------

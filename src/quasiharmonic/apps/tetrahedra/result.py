@@ -130,7 +130,8 @@ class TetrahedraResult(Outcome, Displayable):
 
     See Also
     --------
-    injective_tetrahedra, morph : Make it.
+    injective_tetrahedra : Makes it.
+    morph : Makes it.
     apps.tetrahedra.result.TetrahedraStatus : What each status means.
 
     Examples
@@ -183,7 +184,7 @@ class TetrahedraResult(Outcome, Displayable):
         lines = [self.status.value, self.certificate.summary()]
         if self.forbidden.size:
             which = names_of("tetrahedron", "tetrahedra", self.forbidden)
-            lines.append(f"Inverted or degenerate with four fixed vertices: {which}.")
+            lines.append(f"Inverted or degenerate with four fixed vertices: {which}. Move these vertices less.")
         lines += [obstruction.text for obstruction in self.obstructions[:5]]
         return "\n".join([*lines, self.describe_quality()])
 

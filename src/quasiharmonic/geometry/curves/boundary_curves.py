@@ -66,7 +66,8 @@ class BoundaryCurves:
 
     See Also
     --------
-    polish, morph : Take the curves.
+    polish : Takes the curves.
+    morph : Takes the curves.
     geometry.curves.Curve : One curve.
 
     Examples

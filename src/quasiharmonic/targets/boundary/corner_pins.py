@@ -110,7 +110,10 @@ class Pins:
                 "say which corner each vertex goes to"
             )
         if len(set(self.contour_of.values())) < len(self.contour_of):
-            raise ValueError("two boundary loops have vertices that go to the same contour of the outline")
+            raise ValueError(
+                "two boundary loops have vertices that go to the same contour of the outline: give each loop its own "
+                "contour"
+            )
 
     def _check_vertices(self, chosen: list[Any], n: int) -> None:
         vertices = index_array("corners", chosen)
@@ -151,7 +154,8 @@ class Pins:
         for one, other in itertools.pairwise(found):
             if one[0] == other[0]:
                 raise ValueError(
-                    f"vertices {names[one[1]]} and {names[other[1]]} have the same target position on the outline"
+                    f"vertices {names[one[1]]} and {names[other[1]]} have the same target position on the outline: "
+                    f"move one of them"
                 )
         if positions.size and (np.diff((positions - positions[0]) % len(names)) < 0).any():
             there = positions[np.argsort((positions - positions[0]) % len(names))]

@@ -201,7 +201,8 @@ SHARED: dict[str, Option] = {
     "cut": flag("cut surfaces that cannot be flattened, along seams; vertices and faces of the model are unchanged"),
     "seams": text(
         "WHICH",
-        "seams: file, those of the input's vt (default); none; or a file of edges, two vertices, 0-based, on each line",
+        "seams to use: file, those of the input's vt (default); none; or a file of edges, two vertices, 0-based, on "
+        "each line",
         default="file",
     ),
     "islands": number(
@@ -222,7 +223,7 @@ SHARED: dict[str, Option] = {
     "reference": choice(
         options.REFERENCES, "shape of the triangles in which gradients are taken (default: that of the strategy)"
     ),
-    "rings": number(count, "for distances: largest number of edges between two vertices (default: 20)"),
+    "rings": number(count, "for --energy distances: largest number of edges between two vertices (default: 20)"),
     "surface": file(
         "the surface with the triangles of a FreeSurfer patch (default: beside the patch, such as "
         "lh.inflated for lh.cortex.patch.3d)",

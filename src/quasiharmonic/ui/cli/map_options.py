@@ -116,7 +116,9 @@ def read_edges(path: Path, n: int) -> NDArray[np.int64]:
     rows = []
     for number, ends in read_pairs(path, "an edge"):
         if max(ends) >= n:
-            raise MeshFileError(path, f"vertex {max(ends)} of a mesh with {n}", number, "indices count from 0")
+            raise MeshFileError(
+                path, f"vertex {max(ends)} does not exist: the mesh has {n} vertices", number, "indices count from 0"
+            )
         rows.append(ends)
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
@@ -135,7 +137,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "targets of the boundary", "By default the targets are the texture coordinates (vt) of the input."
     )
-    arguments.add_options(group.add_mutually_exclusive_group(), "fixed", to=arguments.text("OUTLINE", FORMS))
+    arguments.add_options(
+        group.add_mutually_exclusive_group(),
+        "fixed",
+        to=arguments.text("OUTLINE", f"outline for the boundary: {FORMS}"),
+    )
     arguments.add_options(group, "font", "corners", "corner_angle", "cut", "seams")
 
 
