@@ -117,7 +117,7 @@ def read_edges(path: Path, n: int) -> NDArray[np.int64]:
     for number, ends in read_pairs(path, "an edge"):
         if max(ends) >= n:
             raise MeshFileError(
-                path, f"vertex {max(ends)} does not exist: the mesh has {n} vertices", number, "indices count from 0"
+                path, f"vertex {max(ends)} does not exist in a mesh of {n} vertices", number, "indices count from 0"
             )
         rows.append(ends)
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
