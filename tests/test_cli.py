@@ -16,7 +16,7 @@ import pytest
 import problems
 from quasiharmonic import __version__, io
 from quasiharmonic.linsolve import available
-from quasiharmonic.surfaces import random_delaunay
+from quasiharmonic.surfaces import grid, random_delaunay
 from quasiharmonic.ui import cli
 from shared.commands import run, write_input
 from shared.meshes import boundary_of, lift, signed_areas
@@ -268,7 +268,7 @@ def test_help_names_what_an_option_takes(capsys):
     for command, parts in (
         ("morph", ["MESH\n", "-o MESH, --output MESH"]),
         ("flatten", ["-o OUTPUT, --output OUTPUT", "--time-limit SECONDS"]),
-        ("batch", ["for --to: boundary vertices", "for --to: how far"]),
+        ("batch", ["for --to: boundary vertices", "for --to: minimum turn"]),
     ):
         with pytest.raises(SystemExit):
             run(command, "--help")
@@ -358,3 +358,21 @@ def test_generated_problems(name, tmp_path):
     np.testing.assert_array_equal(found.F, F)
     np.testing.assert_array_equal(found.uv[fixed], target)
     assert found.signs().min() == 1
+
+
+@pytest.mark.parametrize(
+    ("gap", "said"),
+    [
+        (5 / 2048, "Islands are at least 5 texels apart at 2048 × 2048."),
+        (9 / 2048, "Islands are more than 8 texels apart at 2048 × 2048."),
+        (0.0, "Islands overlap or touch each other: 0 and 1"),
+        (0.9, None),
+    ],
+)
+def test_check_measures_the_gap_between_islands(tmp_path, capsys, gap, said):
+    V, F = grid(2, 2)
+    V = np.concatenate([0.25 * V, 0.25 * V + [0.25 + gap, 0]])
+    io.write_mapped(tmp_path / "a.obj", io.MeshData(V, np.concatenate([F, F + 9])).with_map(V))
+    assert run("check", tmp_path / "a.obj") == 0
+    out = capsys.readouterr().out
+    assert said in out if said else "apart" not in out

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from quasiharmonic import boundary_loops, distortion, io
+from quasiharmonic import boundary_loops, distortion, io, polish
 from quasiharmonic.surfaces import disk
 from shared.commands import run, write_input
 from shared.solvable_problems import star_problem
@@ -117,6 +117,20 @@ class TestHarmonise:
         error = capsys.readouterr().err
         assert "of zero area in the rest mesh: distortion is undefined there" in error
         assert "reference" not in error
+
+
+@pytest.mark.parametrize(
+    ("energy", "name"), [("symmetric-dirichlet", "symmetric Dirichlet"), ("mips", "MIPS"), ("blend", "blend")]
+)
+def test_the_minimised_energy_is_reported_first(tmp_path, capsys, energy, name):
+    V, F = disk(4)
+    turn = 1.0 - (V**2).sum(axis=1)
+    uv = V * np.cos(turn)[:, None] + V[:, ::-1] * [-1, 1] * np.sin(turn)[:, None]
+    io.write_mapped(tmp_path / "m.obj", io.MeshData(V, F).with_map(uv))
+    assert run("polish", tmp_path / "m.obj", "-o", tmp_path / "o.obj", "--energy", energy, "--max-iterations", 2) == 0
+    result = polish(V, F, uv, energy=energy, max_iterations=2)
+    line = f"{name} from {result.history[0].energy:.3g} to {result.energy:.3g} on average, isometric distortion from "
+    assert line in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -94,8 +94,8 @@ def test_handles_may_pin_the_interior(put, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("0\n1\n5\n", "vertex 5 of a mesh with 5 at line 3; indices count from 0"),
-        ("0\n-1\n", "vertex -1 of a mesh with 5 at line 2"),
+        ("0\n1\n5\n", "vertex 5 does not exist in a mesh of 5 vertices at line 3; indices count from 0"),
+        ("0\n-1\n", "vertex -1 does not exist in a mesh of 5 vertices at line 2"),
         ("0\n1\n\n1\n", "vertex 1, already named at line 2, again at line 4"),
         ("0\n1 2\n", "'1 2' is not an integer at line 2; give one vertex index per line"),
         ("1.0\n", "'1.0' is not an integer at line 1"),

@@ -300,13 +300,17 @@ class TestBeyondRepair:
         uv[2] = np.nan
         result = repair(V, F, uv)
         assert not result.injective
-        assert result.islands[0].reason == "No finite position for the boundary vertex 2."
+        assert result.islands[0].reason == (
+            "No finite position for the boundary vertex 2. Give it one, or flatten the island again."
+        )
 
     def test_vertex_used_twice(self):
         V, F = grid(3, 3)
         F = np.concatenate([F, [[0, 0, 1]]])
         result = repair(V, F, V)
-        assert result.islands[-1].reason == f"A vertex is used twice in triangle {len(F) - 1}."
+        assert result.islands[-1].reason == (
+            f"A vertex is used twice in triangle {len(F) - 1}. Remove such triangles with clean."
+        )
 
     def test_the_result_of_an_undefined_map_is_valid_json(self):
         V, F = grid(3, 3)

@@ -11,7 +11,10 @@ import pytest
 
 import quasiharmonic as qh
 from quasiharmonic import MapResult, Status, atlas
+from quasiharmonic.apps.tetrahedra.result import TetrahedraStatus
+from quasiharmonic.problem.diagnosis import Kind
 from quasiharmonic.results import UnwrapStatus
+from quasiharmonic.surfaces import disk, grid
 from quasiharmonic.util.outcome import BaseOutcome
 
 PAGE = (Path(__file__).parent.parent / "docs" / "reference" / "statuses.md").read_text(encoding="utf-8")
@@ -101,3 +104,76 @@ def test_the_statuses_of_unwrap_are_listed():
     said = "Every chart is bijective", "Every new chart is bijective"
     verified = {status.name for status in UnwrapStatus if status.value.startswith(said)}
     assert {name for name, success in rows if success == "yes"} == verified
+
+
+# Statuses of complete work.
+COMPLETE = {"INJECTIVE", "POLISHED", "NEARBY", "UNWRAPPED", "FIRST_VALID"}
+VERBS = (
+    "Add|Allow|Change|Clean|Correct|Cut|Fix|Flatten|Follow|Give|Make|Move|Open|Permit|Raise|Remove|Reflect|Reverse|"
+    "Smooth|Split|Try|Untwist|Use"
+)
+# The imperative begins a sentence, or follows a colon, a semicolon, a comma with "or", or a condition.
+ACTION = re.compile(rf"(?:^|[.:;] |, |, or )({VERBS}|{VERBS.lower()})\b")
+
+
+def test_the_check_finds_actions():
+    assert ACTION.search("The energy was still falling: allow more iterations.")
+    assert ACTION.search("Every triangle is positive. Cut the surface.")
+    for text in ("This is the best map so far.", "No move is allowed here.", "The obstructions are listed."):
+        assert not ACTION.search(text)
+
+
+@pytest.mark.parametrize("status", [*Status, *UnwrapStatus, *TetrahedraStatus], ids=str)
+def test_a_status_has_an_action_unless_the_work_is_complete(status):
+    assert bool(ACTION.search(status.value)) is (status.name not in COMPLETE)
+
+
+@pytest.mark.parametrize("kind", Kind, ids=str)
+def test_an_obstruction_has_an_action(kind):
+    assert ACTION.search(kind.value)
+
+
+def fold_voxels():
+    field = np.zeros((4, 4, 4, 3))
+    field[1, 1, 1] = field[2, 1, 1] = (5, 0, 0)
+    return qh.nearest_invertible(field, fixed=np.ones((4, 4, 4), dtype=bool))
+
+
+def leave_the_frame():
+    points, F = grid(4, 4)
+    return qh.morph(points, F, [12], [[3.0, 0.5]])
+
+
+def animate_without_map():
+    V, triangles = disk(3)
+    (rim,) = qh.boundary_loops(triangles)
+    return qh.animate(qh.Problem(V, triangles, rim, V[rim]), [V[rim], V[rim] * [-1, 1]])
+
+
+def repair_without_boundary():
+    V, triangles = grid(3, 3)
+    uv = V.copy()
+    uv[0] = np.nan
+    return qh.repair(V, triangles, uv)
+
+
+@pytest.mark.parametrize("call", [fold_voxels, leave_the_frame, animate_without_map, repair_without_boundary])
+def test_the_message_of_a_failure_has_an_action(call):
+    result = call()
+    assert not result.success
+    assert ACTION.search(result.message)
+
+
+def test_statuses_with_an_action_link_to_remedies():
+    table = PAGE.split("| status | what to do |\n")[1].split("\n\n")[0]
+    rows = re.findall(r"^\| (`.+`) \| .+\]\(([^)#]*)(?:#([\w-]+))?\)\. \|$", table, re.MULTILINE)
+    assert len(rows) == table.count("\n")
+    named = {name for names, *_ in rows for name in re.findall(r"`(\w+)`", names)}
+    assert named == {one.name for one in [*Status, *UnwrapStatus, *TetrahedraStatus]} - COMPLETE
+    folder = Path(__file__).parent.parent / "docs" / "reference"
+    for _, page, anchor in rows:
+        text = (folder / (page or "statuses.md")).read_text(encoding="utf-8")
+        headings = [
+            re.sub(r"[^\w -]", "", line).replace(" ", "-").lower() for line in re.findall("^#+ (.+)$", text, re.M)
+        ]
+        assert not anchor or anchor in headings

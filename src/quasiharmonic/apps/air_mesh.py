@@ -63,6 +63,19 @@ class AirMeshState:
         The exact certificate of shapes and air together; there is no overlap if it is bijective.
     energy : float
         Mean elastic energy of the shapes.
+
+    See Also
+    --------
+    AirMesh : Its steps return it.
+
+    Examples
+    --------
+    >>> from quasiharmonic import AirMesh
+    >>> from quasiharmonic.surfaces import grid
+    >>> points, F = grid(2, 2)
+    >>> state = AirMesh(points, F, [[(-1, -1), (3, -1), (3, 3), (-1, 3)]]).moment
+    >>> bool(state.certificate.bijective), len(state.points)
+    (True, 13)
     """
 
     points: FloatArray
@@ -102,6 +115,20 @@ class AirMesh:
     ----------
     moment : AirMeshState
         The current state.
+
+    See Also
+    --------
+    MovingMesh : A mesh that follows its boundary.
+    results.AirMeshState : The state that every step returns.
+
+    Examples
+    --------
+    >>> from quasiharmonic import AirMesh
+    >>> from quasiharmonic.surfaces import grid
+    >>> points, F = grid(2, 2)
+    >>> air = AirMesh(points, F, [[(-1, -1), (3, -1), (3, 3), (-1, 3)]])
+    >>> bool(air.moment.certificate.bijective)
+    True
     """
 
     def __init__(
@@ -118,7 +145,7 @@ class AirMesh:
         idle = np.setdiff1d(np.arange(len(self._rest)), self._F)
         reject(idle, "vertex", "vertices", "no triangle uses {}: remove unused vertices")
         turned = orientation(*(self._rest[self._F[:, k]] for k in range(3))) <= 0
-        reject(turned, "triangle", "triangles", "{} not counterclockwise")
+        reject(turned, "triangle", "triangles", "{} not counterclockwise: reverse the order of their corners")
         check_numbers(air_weight=air_weight)
         if not 0 < air_weight <= 1:
             raise ValueError(f"air_weight must be above 0 and at most 1, not {air_weight}")

@@ -122,6 +122,21 @@ class Energy(ABC):
     barrier : bool
         Whether the energy tends to infinity as a triangle collapses. Barrier energies are infinite and have no
         derivatives where ``det J ≤ 0``. Other energies are finite on inverted triangles too.
+
+    See Also
+    --------
+    polish : Takes an energy.
+    harmonise : Takes an energy.
+    flatten : Takes an energy.
+    quasiharmonic.energies.energies : The energies with a name.
+
+    Examples
+    --------
+    >>> from quasiharmonic import flatten
+    >>> from quasiharmonic.energies.energies import conformal_area_blend
+    >>> from quasiharmonic.surfaces import disk
+    >>> flatten(*disk(4), energy=conformal_area_blend(0.5)).success
+    True
     """
 
     barrier: bool = False

@@ -60,6 +60,19 @@ class Statistics:
         Over all triangles, whatever their area.
     lowest, highest : int
         Triangles with the minimum and the maximum.
+
+    See Also
+    --------
+    Distortion : Its method `statistics` returns them.
+
+    Examples
+    --------
+    >>> from quasiharmonic import distortion
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> statistics = distortion(V, F, V).statistics("conformal")
+    >>> round(statistics.mean, 6), round(statistics.maximum, 6)
+    (1.0, 1.0)
     """
 
     mean: float
@@ -123,6 +136,19 @@ class Distortion(Displayable):
         The surface and the map.
     distances : DistanceError or None
         Error of the distances between vertices, if requested.
+
+    See Also
+    --------
+    distortion : Makes it.
+
+    Examples
+    --------
+    >>> from quasiharmonic import distortion
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> found = distortion(V, F, 3 * V)
+    >>> round(found.scale, 6), bool(found.conformal.max() < 1 + 1e-9)
+    (0.333333, True)
     """
 
     share: FloatArray
@@ -258,6 +284,11 @@ def distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, rings: int | None =
     ValueError
         When an array has the wrong shape, there are no triangles, an index is out of range, or a coordinate is not
         finite.
+
+    See Also
+    --------
+    polish : Lowers the distortion.
+    quasiharmonic.plot : Draws it.
 
     Examples
     --------

@@ -34,6 +34,7 @@ from quasiharmonic.problem.run import Run, run_within
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe, find_exponent, map_array, names_of
 from quasiharmonic.util.options import MapOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
+from quasiharmonic.util.spelling import suggest
 
 #: Polishing steps of `smooth`. On about 10,000 triangles they take a few times as long as the first map and go nearly
 #: as far as convergence: they lower the MIPS energy to a fifth and the worst stretch to a hundredth.
@@ -136,6 +137,13 @@ def polish(
     TimeoutError
         If the time limit is over before the first step.
 
+    See Also
+    --------
+    harmonise : Lowers energies that are no barriers.
+    flatten : Lowers the distortion with a free boundary.
+    distortion : Measures it.
+    quasiharmonic.atlas.polish : Every island of a mesh with seams.
+
     Examples
     --------
     >>> import numpy as np
@@ -222,8 +230,8 @@ def find_energy(energy: str | Energy) -> Energy:
     if isinstance(energy, str):
         if energy not in ENERGIES:
             raise ValueError(
-                f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}; "
-                "energies without a barrier let triangles collapse: use harmonise for them"
+                f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}: use harmonise "
+                f"for energies without a barrier, which let triangles collapse{suggest(energy, ENERGIES)}"
             )
         return ENERGIES[energy]
     if not isinstance(energy, Energy):

@@ -332,7 +332,9 @@ def read_handles(path: str | os.PathLike[str], n: int) -> IntArray:
         except ValueError as error:
             raise MeshFileError(path, str(error), line, "give one vertex index per line") from None
         if not 0 <= vertex < n:
-            raise MeshFileError(path, f"vertex {vertex} of a mesh with {n}", line, "indices count from 0")
+            raise MeshFileError(
+                path, f"vertex {vertex} does not exist in a mesh of {n} vertices", line, "indices count from 0"
+            )
         if vertex in seen:
             raise MeshFileError(path, f"vertex {vertex}, already named at line {seen[vertex]}, again", line)
         seen[vertex] = line

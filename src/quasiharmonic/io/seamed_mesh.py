@@ -52,6 +52,18 @@ class Island:
         Positions of the island's vertices on the surface.
     uv : (m, 2) float64
         Positions in the plane; NaN if unknown.
+
+    See Also
+    --------
+    atlas.SeamedMesh : Lists its islands.
+
+    Examples
+    --------
+    >>> from quasiharmonic.atlas import SeamedMesh
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> [island.triangles.tolist() for island in SeamedMesh(V, F, uv=V).cut([[1, 4], [4, 7]]).islands]
+    [[0, 1, 4, 5], [2, 3, 6, 7]]
     """
 
     F: IntArray
@@ -88,6 +100,8 @@ class SeamedMesh:
     See Also
     --------
     quasiharmonic.atlas.as_seamed_mesh : Accepts a file, or a mesh of another library.
+    atlas.Island : A part between seams.
+    atlas.certify : The verdict on its map.
 
     Attributes
     ----------

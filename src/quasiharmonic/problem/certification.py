@@ -61,7 +61,10 @@ def certify(
 
     See Also
     --------
-    is_injective, inverted_triangles : check the triangles only, for inner loops.
+    is_injective : Checks the triangles only.
+    inverted_triangles : Checks the triangles only.
+    certify_tetrahedra : Checks tetrahedra.
+    quasiharmonic.atlas.certify : Checks a map with seams.
 
     Examples
     --------
@@ -100,6 +103,17 @@ def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
     ------
     ValueError
         If a shape is wrong or an index is out of range, as in `certify`.
+
+    See Also
+    --------
+    inverted_triangles : Which triangles are not strictly positive.
+    certify : Also checks whether the map is bijective.
+
+    Examples
+    --------
+    >>> from quasiharmonic import is_injective
+    >>> is_injective([[0, 1, 2]], [[0, 0], [1, 0], [0, 1]]), is_injective([[0, 1, 2]], [[0, 0], [0, 1], [1, 0]])
+    (True, False)
     """
     return certificate.is_injective(*_convert(F, uv))
 
@@ -123,6 +137,18 @@ def inverted_triangles(F: ArrayLike, uv: ArrayLike) -> IntArray:
     ------
     ValueError
         If a shape is wrong or an index is out of range, as in `certify`.
+
+    See Also
+    --------
+    is_injective : Whether there are none.
+    certify : Also checks whether the map is bijective.
+    repair : Repairs them.
+
+    Examples
+    --------
+    >>> from quasiharmonic import inverted_triangles
+    >>> inverted_triangles([[0, 1, 2], [0, 2, 3]], [[0, 0], [1, 0], [1, 1], [0.9, 0.5]]).tolist()
+    [1]
     """
     return certificate.inverted_triangles(*_convert(F, uv))
 

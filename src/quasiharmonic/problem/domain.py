@@ -147,7 +147,7 @@ class Domain(ReadOnly):
         if flat.size:
             raise ValueError(
                 f"{triangle_names(flat)} of zero area in the rest mesh; "
-                "choose the reference 'equilateral', or repair the mesh"
+                "choose the reference 'equilateral', or remove them with clean"
             )
 
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:

@@ -66,6 +66,20 @@ class MeshReport:
         `find_close_vertices`.
     welded : (k,) int64
         Vertices that are welded to an earlier vertex. Then topology and defects are those of the welded mesh.
+
+    See Also
+    --------
+    inspect_mesh : Makes it.
+
+    Examples
+    --------
+    >>> from quasiharmonic import inspect_mesh
+    >>> from quasiharmonic.surfaces import annulus
+    >>> V, F = annulus(8)
+    >>> F[5] = F[5, ::-1]
+    >>> report = inspect_mesh(V, F)
+    >>> report.clean, [name for name, elements in report.defects.items() if len(elements)]
+    (False, ['edges with mixed winding'])
     """
 
     vertices: int
@@ -160,6 +174,19 @@ def boundary_loops(F: ArrayLike | MeshLike, n: int | None = None) -> list[IntArr
     ValueError
         If the array has the wrong shape, an index is out of range, or the boundary does not form loops, because
         surfaces touch at a vertex or orientations differ; names the vertices.
+
+    See Also
+    --------
+    inspect_mesh : Number of loops, and defects of the mesh.
+    Problem : Takes target positions of these vertices.
+
+    Examples
+    --------
+    >>> from quasiharmonic import boundary_loops
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> [loop.tolist() for loop in boundary_loops(F)]
+    [[0, 1, 2, 5, 8, 7, 6, 3]]
     """
     triangles = triangle_rows(mesh_triangles(F))
     if n is None:
@@ -192,6 +219,12 @@ def inspect_mesh(V: ArrayLike, F: ArrayLike, *, weld: bool | float = False) -> M
     ValueError
         If an array has the wrong shape, a position is not finite, an index is out of range, or there are no triangles.
         Also if ``weld`` is negative or not finite.
+
+    See Also
+    --------
+    clean : Returns the surfaces without the defects.
+    boundary_loops : The vertices of each loop.
+    certify : Checks a map.
 
     Examples
     --------

@@ -86,6 +86,22 @@ class Problem(ReadOnly, Displayable):
         The surface and its fixed vertices. Problems that `with_target` returns share it.
     target : (k, 2) float64
         Target positions as given; not writeable.
+
+    See Also
+    --------
+    solve : Searches for a map.
+    diagnose : Checks whether a map can exist.
+    refine_problem : Splits edges that prevent a map.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, boundary_loops
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> problem = Problem(V, F, rim, V[rim])
+    >>> problem.with_target(2 * V[rim]).domain is problem.domain
+    True
     """
 
     domain: Domain

@@ -26,7 +26,19 @@ if TYPE_CHECKING:
 
 
 class Status(Enum):
-    """Why a call ended; the value is a message for the user with the outcome and the next action."""
+    """Why a call ended; the value is a message for the user with the outcome and the next action.
+
+    See Also
+    --------
+    MapResult : Has a status, and the message of it.
+    results.UnwrapStatus : The statuses of `unwrap`.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Status
+    >>> Status.INJECTIVE.value
+    'Every triangle is strictly positive, verified exactly.'
+    """
 
     INJECTIVE = "Every triangle is strictly positive, verified exactly."
     STALLED = (
@@ -35,14 +47,14 @@ class Status(Enum):
         "(refine=True; --refine), or move the target."
     )
     IMPOSSIBLE = (
-        "No such map exists for this mesh and this target. The diagnosis names the obstructions and how to remove "
-        "them. This is the best map found."
+        "No such map exists for this mesh and this target. This is the best map found. Remove the "
+        "obstructions that the diagnosis names."
     )
     OUT_OF_ITERATIONS = (
         "Some triangles were still inverted after the last iteration. "
         "The energy was still falling: allow more iterations."
     )
-    INTERRUPTED = "Interrupted. This is the best map so far."
+    INTERRUPTED = "Interrupted. This is the best map so far: use it as the initial map of a new call to continue."
     TIME_LIMIT = "The time limit ended the work. This is the best map so far: allow more time to improve it."
     ROUNDED = (
         "The map is injective in the solver's own coordinates, but its smallest triangles invert when the "
@@ -72,7 +84,7 @@ class Status(Enum):
     )
     UNIMPROVED = (
         "Every triangle is strictly positive, verified exactly, but the map is unchanged: no injective map with less "
-        "distortion was found. A smaller eta may help."
+        "distortion was found. Try a smaller eta or another energy."
     )
     PRECISION_LIMIT = (
         "A finer mesh has a map, but double precision cannot express it at the vertices listed: the target is too "
@@ -83,8 +95,8 @@ class Status(Enum):
         "mesh. Use fewer pins, or place them in the order of the mesh. This is the best map of the input mesh."
     )
     UNSOLVABLE = (
-        "No linear solver could factor the system. This is the best map so far. "
-        "Another linear solver or reference triangle may help."
+        "No linear solver could factor the system. This is the best map so far. Try another "
+        "linear_solver or another reference."
     )
 
     @property
@@ -152,6 +164,19 @@ class Stage:
         V₃ divided by the target's area, before and after (dimensionless). For a polish, the mean energy.
     kept : bool
         Whether the result of the stage was kept. A result that makes the map worse is discarded.
+
+    See Also
+    --------
+    MapResult : Lists them as ``stages``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import boundary_loops, injective_map
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> [stage.inverted[1] for stage in injective_map(V, F, rim, V[rim], polish="mips").stages]
+    [0, 0]
     """
 
     name: str
@@ -185,6 +210,18 @@ class Step:
     energy : float
         V₃ divided by the target's area (dimensionless). It is 0 only at injective maps, and decreases towards them. In
         a polish, the mean energy.
+
+    See Also
+    --------
+    MapResult : Lists them as ``history``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import flatten
+    >>> from quasiharmonic.surfaces import disk
+    >>> history = flatten(*disk(4)).history
+    >>> history[0].iteration, history[-1].inverted
+    (0, 0)
     """
 
     iteration: int
@@ -201,6 +238,18 @@ class Snapshot:
     iteration : int
     uv : (n, 2) float64
         Positions of the vertices.
+
+    See Also
+    --------
+    MapResult : Lists them as ``path``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import flatten
+    >>> from quasiharmonic.surfaces import starfish, disk
+    >>> path = flatten(*disk(4), record_every=1).path
+    >>> path[0].iteration, path[0].uv.shape
+    (0, (61, 2))
     """
 
     iteration: int
@@ -221,6 +270,20 @@ class RefinementAttempt:
         Whether the map is injective (certified).
     seconds : float
         Wall time.
+
+    See Also
+    --------
+    injective_map : Makes attempts with ``refine=True``.
+    MapResult : Lists them as ``refinement_attempts``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import injective_map
+    >>> V, F = [[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]]
+    >>> result = injective_map(V, F, range(4), [[0, 0], [0.5, 0.4], [1, 0], [0.5, 1]], refine=True)
+    >>> attempt = result.refinement_attempts[-1]
+    >>> attempt.injective, attempt.added
+    (True, 1)
     """
 
     name: str
@@ -273,6 +336,20 @@ class MapResult(ReadOnly, Displayable, Outcome):
         The attempts in order, if ``refine`` allowed to split edges.
     crowded : (c,) int64
         With ``PRECISION_LIMIT``, the fixed vertices next to the triangles that stay inverted.
+
+    See Also
+    --------
+    Status : What each status means.
+    Certificate : The exact verdict on the map.
+    InverseMap : The inverse of the map.
+
+    Examples
+    --------
+    >>> from quasiharmonic import flatten
+    >>> from quasiharmonic.surfaces import disk
+    >>> result = flatten(*disk(4))
+    >>> result.success, result.status.name, result.uv.shape
+    (True, 'POLISHED', (61, 2))
     """
 
     uv: NDArray[np.float64]

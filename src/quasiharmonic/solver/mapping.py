@@ -123,6 +123,13 @@ def injective_map(
     ValueError
         If the input is malformed; see `Problem`.
 
+    See Also
+    --------
+    flatten : If the boundary may move.
+    injective_maps : Many small problems, several times as fast.
+    polish : Lowers the distortion of the map.
+    diagnose : Why there is no map.
+
     Examples
     --------
     Map a square annulus onto itself with its hole turned by 90°:
@@ -166,6 +173,21 @@ def solve(problem: Problem | ProblemArrays, **options: Unpack[MapKeywords]) -> M
         If an option is unknown or invalid, or ``start`` does not have shape (n, 2) or contains a non-finite position.
     ImportError
         If the named linear solver is not installed.
+
+    See Also
+    --------
+    injective_map : The same without a `Problem`.
+    injective_maps : Many small problems.
+    quasiharmonic.io.read_problem : Reads a problem from a folder.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, boundary_loops, solve
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> solve(Problem(V, F, rim, 2 * V[rim])).success
+    True
     """
     if isinstance(problem, ProblemArrays):
         problem = Problem(*problem)
@@ -231,6 +253,20 @@ def quasi_harmonic_map(
         If ``mu`` has the wrong shape or a modulus of 1 or more; the message names the triangles.
     quasiharmonic.linsolve.NotPositiveDefinite
         If the Laplacian is not positive definite after rounding.
+
+    See Also
+    --------
+    injective_map : Searches for tensors whose map is injective.
+    quasi_harmonic_derivative : The derivative of the map.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, boundary_loops, is_injective, quasi_harmonic_map
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> is_injective(F, quasi_harmonic_map(Problem(V, F, rim, V[rim])))
+    True
     """
     check_problem("quasi_harmonic_map", problem)
     check_choice("reference", reference, get_args(Reference))

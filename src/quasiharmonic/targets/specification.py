@@ -24,8 +24,10 @@ from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter, wo
 from quasiharmonic.targets.outlines.shapes import read_polylines
 from quasiharmonic.targets.outlines.svg import read_svg, svg_paths
 from quasiharmonic.util.arrays import FloatArray, check_numbers
+from quasiharmonic.util.spelling import suggest
 
-FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
+_SHAPES = "disk", "ellipse:2x1", "rect:2x1", "polygon:6", "star:5", "ring:0.5", "letter:G", "word:QH"
+FORMS = f"{', '.join(_SHAPES)}, or a file .svg, .txt or .csv"
 _POINT_FILES = ".txt", ".csv"
 #: Default deviation of contours from curves.
 TOLERANCE = 1e-6
@@ -99,14 +101,14 @@ def outline(
             return [outlines.regular_polygon(_count(text, argument))]
         case "star", ":":
             return [outlines.star(_count(text, argument))]
-    raise ValueError(f"unknown outline {text!r}: use {FORMS}")
+    raise ValueError(f"unknown outline {text!r}: use {FORMS}{suggest(text, _SHAPES)}")
 
 
 def _number(text: str, argument: str) -> float:
     try:
         return float(argument)
     except ValueError:
-        raise ValueError(f"{text!r}: {argument!r} is not a number") from None
+        raise ValueError(f"{text!r}: {argument!r} is not a number, such as 0.5 in ring:0.5") from None
 
 
 def _pair(text: str, argument: str) -> tuple[float, float]:
@@ -118,9 +120,9 @@ def _pair(text: str, argument: str) -> tuple[float, float]:
 
 def _count(text: str, argument: str) -> int:
     if not (argument.isascii() and argument.isdigit()):
-        raise ValueError(f"{text!r}: {argument!r} is not a whole number")
+        raise ValueError(f"{text!r}: {argument!r} is not a whole number, such as 5 in star:5")
     if len(argument) > 6 or int(argument) > MAX_POINTS // 2:
-        raise ValueError(f"{text!r}: {argument} is too many")
+        raise ValueError(f"{text!r}: {argument} is too many: at most {MAX_POINTS // 2} are possible")
     return int(argument)
 
 

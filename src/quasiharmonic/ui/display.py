@@ -15,6 +15,7 @@ import numpy as np
 
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
+from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.energies.measures import Distortion
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.problem import Problem
@@ -53,6 +54,8 @@ def draw(shown: Displayable, kind: str, *, measure: str = "isometric") -> Figure
             qualities, worst = (shown.quality_before, shown.quality_after), int(shown.quality_after.argmin())
             drawn = [cut_tetrahedra(shown.T, points, worst) for points in (shown.points_before, shown.points)]
             return elements_figure(drawn, qualities, shown.inverted)
+        case UnwrapResult():
+            return plot.plot_unwrap(shown.V[shown.vmapping], shown.indices, shown.uvs)
         case Distortion():
             return plot.plot_distortion(shown.V, shown.F, shown.uv, measure)
         case Problem():
@@ -123,7 +126,7 @@ def _picture(shown: Displayable) -> str:
     if count == 0:
         return ""
     if count > MAX_TRIANGLES:
-        return f"<em>{count:,} triangles are drawn when asked for: .plot()</em>"
+        return f"<em>{count:,} triangles: call .plot() to draw them</em>"
     try:
         data = b64encode(_png(draw(shown, "map"))).decode()
     except (ValueError, ImportError) as error:
@@ -147,4 +150,4 @@ def _triangles(shown: Displayable) -> int:
     surface = shown.problem if isinstance(shown, Diagnosis) else shown
     if isinstance(surface, MapResult) and surface.V is None:
         return 0
-    return len(getattr(surface, "F", ()))
+    return len(surface.indices if isinstance(surface, UnwrapResult) else getattr(surface, "F", ()))

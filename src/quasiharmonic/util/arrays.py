@@ -283,7 +283,9 @@ def map_array(name: str, uv: ArrayLike, n: int | None = None, *, finite: bool = 
     array = real_array(name, getattr(uv, "uv", uv))
     if array.ndim != 2 or array.shape[1] != 2 or n not in (None, len(array)):
         wanted = "(n, 2)" if n is None else f"({n}, 2), one position for each vertex"
-        raise ValueError(f"{name} must have shape {wanted}, not {array.shape}")
+        flat = array.ndim == 2 and array.shape[1] == 3 and n in (None, len(array))
+        advice = f"; if the third coordinate has no meaning, pass {name}[:, :2]" if flat else ""
+        raise ValueError(f"{name} must have shape {wanted}, not {array.shape}{advice}")
     if finite:
         check_finite(name, "vertex", "vertices", array)
     return array
@@ -303,7 +305,7 @@ def fixed_vertices(fixed: ArrayLike, n: int) -> IntArray:
     array = vertex_indices("fixed", fixed, n)
     times = np.bincount(array, minlength=n)
     if times.max(initial=0) > 1:
-        raise ValueError(f"{vertex_names(np.flatnonzero(times > 1))} fixed more than once")
+        raise ValueError(f"{vertex_names(np.flatnonzero(times > 1))} fixed more than once: list each vertex once")
     return array
 
 
@@ -337,7 +339,8 @@ def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
     """Raise a ValueError that names the first rows with NaN or infinite numbers; ``one``, ``many`` name a row."""
     finite = np.isfinite(rows)
     if not finite.all():
-        raise ValueError(f"{name} is not finite at {names_of(one, many, np.flatnonzero(~finite.all(axis=1)))}")
+        which = names_of(one, many, np.flatnonzero(~finite.all(axis=1)))
+        raise ValueError(f"{name} is not finite at {which}: give finite numbers")
 
 
 def reject(found: BoolArray | IntArray, one: str, many: str, message: str) -> None:

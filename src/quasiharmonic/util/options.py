@@ -235,7 +235,7 @@ def takes(options: type[Options], keywords: type) -> Callable[[F], F]:
 class SolverOptions(Options):
     """Options of every operation that solves linear systems step by step."""
 
-    linear_solver: str = option("auto", "(default: the fastest one installed)", choices=LINEAR_SOLVERS)
+    linear_solver: str = option("auto", "linear solver (default: the fastest one installed)", choices=LINEAR_SOLVERS)
     callback: Callable[[Any], object] | None = option(None, check=function)
 
 
@@ -253,7 +253,7 @@ class MapOptions(SolverOptions):
     )
     polish: Any = option(None)
     start: Any = option(None)
-    max_iterations: int = option(MAX_ITERATIONS, "(default: 2000)", check=positive)
+    max_iterations: int = option(MAX_ITERATIONS, "maximum number of linear solves (default: 2000)", check=positive)
     record_every: int = option(0, check=count)
     time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     slide: Any = option(False)
@@ -267,7 +267,10 @@ def one_of(*words: str | None) -> Check:
 
     def check(name: str, value: Any) -> None:
         if not isinstance(value, str | None) or value not in words:
-            raise ValueError(f"{name} must be one of {', '.join(map(str, words))}, not {value!r}")
+            raise ValueError(
+                f"{name} must be one of {', '.join(map(str, words))}, not {value!r}"
+                f"{suggest(value, [word for word in words if word])}"
+            )
 
     return check
 
@@ -299,9 +302,9 @@ class DescentOptions(Options):
 class PolishOptions(SolverOptions):
     """Options of `quasiharmonic.polish`."""
 
-    energy: Any = option("symmetric-dirichlet", "(default: symmetric-dirichlet)", choices=ENERGIES)
+    energy: Any = option("symmetric-dirichlet", "energy to lower (default: symmetric-dirichlet)", choices=ENERGIES)
     weights: Any = option(None)
-    max_iterations: int = option(200, "(default: 200)", check=count)
+    max_iterations: int = option(200, "maximum number of Newton steps (default: 200)", check=count)
     tol: float = option(1e-4, check=tolerance)
     time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     slide: Any = option(False)
@@ -311,12 +314,12 @@ class PolishOptions(SolverOptions):
 class HarmoniseOptions(SolverOptions):
     """Options of `quasiharmonic.harmonise`."""
 
-    energy: Any = option("arap", "(default: arap)", choices=HARMONISED)
+    energy: Any = option("arap", "energy to lower (default: arap)", choices=HARMONISED)
     eta: Any = option(None)
     conformal: float = option(1e-3, check=tolerance)
     weights: Any = option(None)
     scaled: bool = option(True, check=switch)
-    max_iterations: int = option(40, "linear solves per round (default: 40)", check=positive)
+    max_iterations: int = option(40, "maximum number of linear solves per round (default: 40)", check=positive)
     tol: float = option(1e-3, check=tolerance)
     reference: str = option("rest", check=reference_name)
 
@@ -415,12 +418,15 @@ class BakeOptions(Options):
 
     size: Any = option(2048, check=texture_size)
     samples: int = option(
-        1, "samples along each side of a texel, whose mean it gets, 1 to 16 (default: 1)", check=sample_count
+        1, "samples along each side of a texel, which gets their mean, 1 to 16 (default: 1)", check=sample_count
     )
-    padding: int = option(16, "texels beside charts that get the values of the nearest ones (default: 16)", check=count)
+    padding: int = option(
+        16, "texels around each chart that get the value of the nearest texel of a chart (default: 16)", check=count
+    )
     max_distance: float = option(
         0.05,
-        "how far the old model may be from the new one, relative to the diagonal of its bounding box (default: 0.05)",
+        "maximum distance between both models, relative to the diagonal of the bounding box of the new one (default: "
+        "0.05)",
         check=tolerance,
     )
     jpeg: bool = option(False, "write colours without opacity as JPEG (default: PNG)", check=switch)
@@ -432,7 +438,7 @@ class UnwrapOptions(Options):
 
     max_stretch: float = option(
         1.5,
-        "bound on the stretch, which 99 %% of the surface keep; smaller values need more seams (default: 1.5)",
+        "bound on the stretch at 99 %% of the surface; smaller values need more seams (default: 1.5)",
         check=stretch_bound,
     )
     max_charts: int | None = option(None, "maximum number of charts (default: no limit)", check=positive_or_none)
@@ -445,17 +451,18 @@ class UnwrapOptions(Options):
     )
     up: str | None = option(
         None,
-        "axis that points up: seams prefer places below and in concave edges, as --up z or --up=-z (default: none)",
+        "axis that points up, as in --up z or --up=-z: seams cost less on downward faces and in concave edges "
+        "(default: none)",
         check=direction_or_none,
         choices=UPS,
     )
     packing_loss: float = option(
         0.02,
-        "share of the texture that may stay unused so that flat and developable parts are joined (default: 0.02)",
+        "share of the texture that may be lost when flat and developable parts are joined (default: 0.02)",
         check=share,
     )
     divide_for_packing: bool = option(
-        False, "also divide flat and developable parts where the texture is used better then", check=switch
+        False, "also divide flat and developable parts where this saves texture", check=switch
     )
     straighten: bool = option(
         False, "make strips of quadrilaterals rectangles, as far as the bound on the stretch permits", check=switch
@@ -463,7 +470,7 @@ class UnwrapOptions(Options):
     resolution: Any = option(2048)
     padding: float = option(4.0, "minimum texels between two charts (default: 4)")
     texels_per_unit: float | None = option(None, "texels per unit of length of the model (default: as many as fit)")
-    tiles: int = option(1, "UDIM tiles (default: 1)", check=positive)
+    tiles: int = option(1, "number of UDIM tiles (default: 1)", check=positive)
     tile_by: Any = option(None)
     lightmap: bool = option(
         False,

@@ -170,7 +170,7 @@ def animate(problem: Problem, targets: Iterable[ArrayLike], **options: Unpack[An
         Distortion energy to lower in every frame, without jumps between local minima; see `quasiharmonic.polish`.
     max_motion_ratio : float, optional
         Requires ``polish``. Maximum vertex displacement, relative to the maximum boundary displacement; at least 1,
-        default 3. The limit may not be reached; the result has the value that was.
+        default 3. `Animation.largest_move` is the value that was reached, which may be larger.
     fill_gaps : bool
         If a target has no map, or none is found, interpolate its target between the neighbouring frames with a map.
         Frames at the ends stay without a map.
@@ -196,6 +196,12 @@ def animate(problem: Problem, targets: Iterable[ArrayLike], **options: Unpack[An
     ValueError
         If a target has another size or a non-finite value (the message names the frame), an option is invalid, or
         ``max_motion_ratio`` is given without ``polish``.
+
+    See Also
+    --------
+    injective_map : One target.
+    injective_maps : Targets that do not depend on each other.
+    MovingMesh : Small steps of a simulation mesh.
 
     Examples
     --------

@@ -34,6 +34,21 @@ class FrameStep:
     move : float
         Maximum vertex displacement between frames so far, relative to that of the boundary; 0 before there are two
         frames.
+
+    See Also
+    --------
+    animate : Passes it to its callback.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, animate, boundary_loops
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> steps = []
+    >>> animation = animate(Problem(V, F, rim, V[rim]), [V[rim], 2 * V[rim]], callback=steps.append)
+    >>> steps[-1].frame, steps[-1].frames
+    (1, 2)
     """
 
     frame: int
@@ -44,7 +59,22 @@ class FrameStep:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AnimationVerdict(Verdict):
-    """The exact verdict on the frames of an animation: one certificate for each."""
+    """The exact verdict on the frames of an animation: one certificate for each.
+
+    See Also
+    --------
+    Animation : Has it as its certificate.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, animate, boundary_loops
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> verdict = animate(Problem(V, F, rim, V[rim]), [V[rim], 2 * V[rim]]).certificate
+    >>> verdict.valid, len(verdict.frames)
+    (True, 2)
+    """
 
     frames: tuple[Certificate, ...]
 
@@ -88,6 +118,21 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
         not polished.
     interrupted : bool
         Whether Ctrl-C ended the work before completion.
+
+    See Also
+    --------
+    animate : Makes it.
+    MapResult : The result of each frame.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, animate, boundary_loops
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> animation = animate(Problem(V, F, rim, V[rim]), [V[rim], 2 * V[rim]])
+    >>> len(animation), animation[1].status.name, animation.success
+    (2, 'INJECTIVE', True)
     """
 
     frames: list[MapResult]
@@ -196,6 +241,8 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
         """Return a text with the number of certified frames, the reasons for missing ones, and the largest move."""
         found, count = self.found, count_of("frame", "frames", len(self.frames))
         lines = [f"{count}: {np.count_nonzero(found)} with every triangle strictly positive, verified exactly"]
+        if not found.all():
+            lines[0] += "; change the targets of the others, or use fill_gaps=True"
         if self.interrupted:
             lines.append("interrupted before the last frame")
         if self.bridged.any():

@@ -58,6 +58,19 @@ class IslandVerdict(IslandReport):
         The certificate, in the island's own numbering.
     inverted : (a,) int64
         Triangles that are not strictly positive (mirrored islands: not strictly negative).
+
+    See Also
+    --------
+    atlas.AtlasVerdict : Lists them as ``islands``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> (island,) = atlas.certify(atlas.SeamedMesh(V, F, uv=V)).islands
+    >>> island.mirrored, island.certificate.injective, island.inverted.tolist()
+    (False, True, [])
     """
 
     certificate: Certificate
@@ -102,6 +115,20 @@ class AtlasVerdict(Verdict):
         Verdicts, in the order of each island's first triangle.
     overlapping : (p, 2) int64
         Pairs of bijective islands that share points of the plane, as indices of ``islands``; at most 1000.
+
+    See Also
+    --------
+    atlas.certify : Makes it.
+    Certificate : The verdict on a map without seams.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> verdict = atlas.certify(atlas.SeamedMesh(V, F, uv=V))
+    >>> verdict.valid, len(verdict.overlapping)
+    (True, 0)
     """
 
     islands: tuple[IslandVerdict, ...]
@@ -183,6 +210,11 @@ def certify(mesh: SeamedMesh | MeshLike, *, weld: bool | float = False) -> Atlas
     ------
     ValueError
         If ``weld`` is negative or not finite.
+
+    See Also
+    --------
+    quasiharmonic.certify : A map without seams.
+    atlas.AtlasVerdict : The verdict.
 
     Examples
     --------

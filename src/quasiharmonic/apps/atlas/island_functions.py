@@ -86,6 +86,19 @@ def polish(
     ------
     ValueError
         If an island is not injective or not a surface; the message names its first triangle.
+
+    See Also
+    --------
+    quasiharmonic.polish : A map without seams.
+    atlas.harmonise : Energies that are no barriers.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> atlas.polish(atlas.SeamedMesh(V, F, uv=V)).success
+    True
     """
     mesh = as_seamed_mesh(mesh)
     _reject_weld(rest)
@@ -125,6 +138,19 @@ def harmonise(mesh: SeamedMesh | MeshLike, *, fixed: ArrayLike | None = None, **
     Returns
     -------
     MappedAtlas
+
+    See Also
+    --------
+    quasiharmonic.harmonise : A map without seams.
+    atlas.polish : Faster for barriers.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> atlas.harmonise(atlas.SeamedMesh(V, F, uv=V * [2, 1]), energy="arap").success
+    True
     """
     mesh = as_seamed_mesh(mesh)
     checked = _check_fixed(mesh, fixed)
@@ -163,6 +189,19 @@ def injective_map(
     -------
     MappedAtlas
         If an island has no injective map, its result reports it.
+
+    See Also
+    --------
+    quasiharmonic.injective_map : A surface without seams.
+    quasiharmonic.targets : The outlines.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(4, 4)
+    >>> atlas.injective_map(atlas.SeamedMesh(V, F), to="disk").success
+    True
     """
     mesh = as_seamed_mesh(mesh)
     checked = _check_fixed(mesh, fixed)
@@ -220,6 +259,20 @@ def flatten(
     MappedAtlas
         In the surface's unit of length, or in the unit square. After Ctrl-C the remaining islands keep their positions,
         and the others keep their centre, direction and area.
+
+    See Also
+    --------
+    quasiharmonic.flatten : One surface without seams.
+    atlas.pack : Packs the islands afterwards.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> mapped = atlas.flatten(atlas.SeamedMesh(V, F).cut([[1, 4], [4, 7]]))
+    >>> mapped.success, len(mapped.islands)
+    (True, 2)
     """
     mesh = as_seamed_mesh(mesh)
     _reject_weld(rest)
@@ -341,6 +394,20 @@ def pack(
     ValueError
         If an island has no positions or the islands do not fit; if an island has triangles so thin that rounding to
         positions in the square would invert them.
+
+    See Also
+    --------
+    atlas.pack_charts : Packs arrays into one or several textures.
+    atlas.flatten : Makes the islands.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> packed = atlas.pack(atlas.flatten(atlas.SeamedMesh(V, F).cut([[1, 4], [4, 7]])).mesh)
+    >>> bool(packed.uv.min() >= 0), bool(packed.uv.max() <= 1)
+    (True, True)
     """
     # Packing needs scipy.spatial, which takes longer to load than most maps take.
     from quasiharmonic.apps.atlas.packing.pack import pack_charts

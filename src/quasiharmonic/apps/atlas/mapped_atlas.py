@@ -35,6 +35,19 @@ class MappedIsland(IslandReport):
         Whether the island is mirrored. If so, ``result`` belongs to its reflection about the v axis.
     result : MapResult
         The result, in the island's own numbering.
+
+    See Also
+    --------
+    atlas.MappedAtlas : Lists them as ``islands``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (island,) = atlas.flatten(atlas.SeamedMesh(V, F)).islands
+    >>> island.mirrored, island.result.status.name
+    (False, 'POLISHED')
     """
 
     result: MapResult
@@ -55,6 +68,23 @@ class MappedAtlas(Outcome):
     islands : tuple of MappedIsland
         Results in the order of each island's first triangle. After Ctrl-C the remaining islands are not listed and
         keep their positions.
+
+    See Also
+    --------
+    atlas.flatten : Makes it.
+    atlas.polish : Makes it.
+    atlas.harmonise : Makes it.
+    atlas.injective_map : Makes it.
+    atlas.certify : The verdict on its mesh.
+
+    Examples
+    --------
+    >>> from quasiharmonic import atlas
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> mapped = atlas.flatten(atlas.SeamedMesh(V, F))
+    >>> mapped.status.name, mapped.mesh.uv.shape
+    ('POLISHED', (61, 2))
     """
 
     mesh: SeamedMesh
@@ -160,7 +190,7 @@ def check_island_choice(mesh: SeamedMesh, only: Collection[int] | None) -> Colle
         return range(count)
     absent = np.setdiff1d(list(only), np.arange(count))
     if not only:
-        raise ValueError("no island is chosen")
+        raise ValueError("no island is chosen: name at least one")
     if absent.size:
         raise ValueError(f"there is no {names_of('island', 'islands', absent)}: the mesh has {count}, from 0")
     bare = np.array([k for k, island in enumerate(mesh.islands) if k not in only and np.isnan(island.uv).any()])

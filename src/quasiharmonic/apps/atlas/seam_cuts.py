@@ -66,6 +66,19 @@ class CutMesh(NamedTuple):
         The same triangles in the same order. Triangles on one side of a cut refer to the copies.
     origin : (n + c,) int64
         The old index of each vertex or copy.
+
+    See Also
+    --------
+    cut_open : Makes it.
+
+    Examples
+    --------
+    >>> from quasiharmonic import cut_open
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> opened = cut_open(V, F, edges=[[1, 4]])
+    >>> opened.origin.tolist()
+    [0, 1, 2, 3, 4, 5, 6, 7, 8, 1]
     """
 
     V: FloatArray
@@ -97,6 +110,20 @@ def cut_open(V: ArrayLike, F: ArrayLike, *, edges: ArrayLike | None = None, min_
     ------
     ValueError
         As `quasiharmonic.find_cuts`.
+
+    See Also
+    --------
+    find_cuts : Finds edges along which to cut.
+    unwrap : Cuts, flattens and packs.
+
+    Examples
+    --------
+    >>> from quasiharmonic import cut_open, inspect_mesh
+    >>> from quasiharmonic.surfaces import starfish
+    >>> V, F = starfish(3, 4)
+    >>> opened = cut_open(V, F)
+    >>> inspect_mesh(V, F).loops, inspect_mesh(opened.V, opened.F).loops
+    (0, 1)
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))

@@ -65,13 +65,28 @@ class BakeResult(BaseOutcome):
     covered : int
         Number of texels whose centre, or one of whose samples, is in a triangle.
     missing : int
-        Number of these that are too far from the old model. They have the colour `MISSING`, magenta.
+        Number of covered texels that are too far from the old model. They have the colour `MISSING`, magenta.
     same_mesh : bool
         Whether both models have the same triangles, so that points correspond exactly.
     problems : tuple of str
         Textures that could not be used, with the reason, and other parts of the look that are not baked.
     seconds : float
         Wall time of the call.
+
+    See Also
+    --------
+    bake : Makes it.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import bake, io, unwrap
+    >>> from quasiharmonic.surfaces import starfish
+    >>> V, F = starfish(3, 4)
+    >>> old = io.MeshData(V, F, extra=np.tile([0.0, 0.0, 1.0], (len(V), 1)))
+    >>> result = bake(old, unwrap(V, F), size=64)
+    >>> result.success, result.colour.shape, result.problems
+    (True, (64, 64, 4), ())
     """
 
     mesh: MeshData
@@ -103,6 +118,8 @@ class BakeResult(BaseOutcome):
                 f" {count_of('texel is', 'texels are', self.missing)} too far from the old model, and magenta: "
                 "raise max_distance, or check that both models are in the same place."
             )
+        if self.problems:
+            text += f" {count_of('problem', 'problems', len(self.problems))}: correct the old model as listed."
         return text
 
     def summary(self) -> str:
@@ -164,6 +181,11 @@ def bake(old: MeshOrPath, new: MeshOrPath | UnwrapResult, **options: Unpack[Bake
         triangles.
     quasiharmonic.io.MeshFileError
         If a file cannot be read.
+
+    See Also
+    --------
+    unwrap : Makes texture coordinates.
+    quasiharmonic.io.write_mapped : Writes the model with its textures.
 
     Examples
     --------
@@ -232,7 +254,9 @@ class _Baker:
         for axis in range(2):
             outside |= (uv[:, :, axis].max(axis=1) < 0) | (uv[:, :, axis].min(axis=1) > 1)
         if (outside | bare).all():
-            raise ValueError("the new model has no texture coordinates in the unit square")
+            raise ValueError(
+                "the new model has no texture coordinates in the unit square: move them there, or unwrap it again"
+            )
         if outside.any():
             count = count_of("triangle is", "triangles are", int(outside.sum()))
             self.problems.append(f"{count} outside the unit square of the new texture coordinates, and not baked")

@@ -33,7 +33,7 @@ class TangentFrames(NamedTuple):
     side: FloatArray
 
     def at(self, triangle: IntArray, barycentric: FloatArray) -> FloatArray:
-        """Return tangent, bitangent and normal (k, 3, 3), as rows, at points of triangles; they need not be unit."""
+        """Return tangent, bitangent and normal (k, 3, 3), as rows, at points of triangles, not normalised."""
         normal = np.einsum("kc,kcd->kd", barycentric, self.normal[triangle])
         tangent = np.einsum("kc,kcd->kd", barycentric, self.tangent[triangle])
         bitangent = np.cross(normal, tangent) * self.side[triangle, None]

@@ -33,6 +33,19 @@ class InverseField:
     error : float
         Maximum distance of a pixel from itself after the inverse and the given field, in the field's unit; caused by
         rounding only.
+
+    See Also
+    --------
+    inverse_field : Makes it.
+    results.InverseVolume : The inverse on voxels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import inverse_field
+    >>> back = inverse_field(np.full((4, 4, 2), 1.0))
+    >>> back.field[2, 2].tolist(), bool(back.outside[0, 0])
+    ([-1.0, -1.0], True)
     """
 
     field: FloatArray
@@ -68,6 +81,11 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
         If the field folds, its border overlaps itself, it is not finite, or an argument has the wrong shape. The
         message names the pixels.
 
+    See Also
+    --------
+    nearest_invertible : Removes folds first.
+    InverseMap : The inverse of a map of a surface.
+
     Notes
     -----
     At its pixels the inverse is exact to rounding. Between them it is interpolated, although the true inverse is not
@@ -90,7 +108,7 @@ def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField
     positions, F = grid.positions(given).reshape(-1, 2), grid.triangles()
     certificate = certify(F, positions)
     if not certificate.bijective:
-        raise ValueError(f"the field has no inverse. {certificate.summary()}")
+        raise ValueError(f"the field has no inverse. {certificate.summary()} Change the displacements at the border.")
     pixels = grid.points.reshape(-1, 2)
     triangle = PointLocator(positions[F]).find(pixels)
     found = np.flatnonzero(triangle >= 0)

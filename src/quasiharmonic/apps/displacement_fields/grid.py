@@ -210,7 +210,7 @@ def check_field(field: ArrayLike) -> FloatArray:
         raise ValueError(f"field must have shape {_WORDS[dimension].field}, not {array.shape}{advice}")
     bad = np.asarray(~np.isfinite(array).all(axis=-1))
     if bad.any():
-        raise ValueError(f"field is not finite at {name_points(bad)}")
+        raise ValueError(f"field is not finite at {name_points(bad)}: give finite displacements")
     return array
 
 
@@ -229,7 +229,7 @@ def check_unfolded(wrong: BoolArray) -> None:
     if wrong.any():
         raise ValueError(
             f"the field folds, so it has no inverse: at the cells whose first {_WORDS[wrong.ndim].many} are "
-            f"{name_points(wrong)}. use `nearest_invertible` to get the nearest invertible field"
+            f"{name_points(wrong)}; use nearest_invertible (qhm field) to get the nearest invertible field"
         )
 
 

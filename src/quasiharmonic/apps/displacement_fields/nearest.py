@@ -101,6 +101,21 @@ class InvertibleField(NearestField):
     distance : float
         Root mean square distance from the given field, over all pixels, in the field's unit.
     seconds : float
+
+    See Also
+    --------
+    nearest_invertible : Makes it.
+    results.InvertibleVolume : The result for voxels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import nearest_invertible
+    >>> field = np.zeros((6, 6, 2))
+    >>> field[3, 3, 0] = 2.0
+    >>> result = nearest_invertible(field)
+    >>> result.success, result.folds > 0, bool(result.moved_mask[3, 3])
+    (True, True, True)
     """
 
     certificate: Certificate
@@ -159,6 +174,12 @@ def nearest_invertible(
         If no field was found, because of fixed pixels or because displacements are too large for the precision of
         doubles.
 
+    See Also
+    --------
+    apps.displacement_fields.nearest.fold_free : Checks which cells fold.
+    inverse_field : Inverts the result.
+    warp_by_landmarks : Makes an invertible warp from landmarks.
+
     Notes
     -----
     Fields on voxels (d, h, w, 3) have displacements along x, y and z in slice z, row y and column x. Each cell between
@@ -202,7 +223,9 @@ def nearest_invertible(
         positions = np.stack([here.real, here.imag], axis=-1) * grid.unit
         repaired[moved] = (positions - grid.points)[moved]
         if not is_fold_free(grid, repaired).all():
-            raise RuntimeError("rounding folds the new field: its displacements are too large for its spacing")
+            raise RuntimeError(
+                "rounding folds the new field: its displacements are too large for its spacing; scale them down"
+            )
     certificate = certify(grid.triangles(), grid.positions(repaired).reshape(-1, 2))
     return InvertibleField.of(given, repaired, wrong, began, certificate=certificate)
 
@@ -215,6 +238,19 @@ def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0, interpolation: str 
     cell must be positive, decided exactly. ITK and ANTs sample fields with ``"trilinear"`` interpolation. Then a cell
     is free of folds if all Bernstein coefficients of its Jacobian determinant are positive. This is sufficient, not
     necessary. Other arguments and errors are those of `nearest_invertible`.
+
+    See Also
+    --------
+    nearest_invertible : Removes the folds.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic.apps.displacement_fields.nearest import fold_free
+    >>> field = np.zeros((3, 4, 2))
+    >>> field[:, 3, 0] = -2.0
+    >>> fold_free(field).tolist()
+    [[True, True, False], [True, True, False]]
     """
     check_choice("interpolation", interpolation, INTERPOLATIONS)
     if np.ndim(field) == 4:
@@ -223,7 +259,7 @@ def fold_free(field: ArrayLike, *, spacing: ArrayLike = 1.0, interpolation: str 
             return np.asarray(least_coefficients(volume, scaled) > 0)
         return ~find_folded_cells(volume, scaled, None)
     if interpolation != "linear":
-        raise ValueError("trilinear interpolation is that of volumes: omit interpolation")
+        raise ValueError("trilinear interpolation applies only to volumes: omit interpolation")
     given = check_field(field)
     return is_fold_free(PixelGrid(given.shape[:2], spacing), given)
 

@@ -57,7 +57,19 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True, eq=False, repr=False)
 class VoxelVerdict(Verdict):
-    """The exact verdict on a displacement field on voxels; see `InvertibleVolume` for the attributes."""
+    """The exact verdict on a displacement field on voxels; see `InvertibleVolume` for the attributes.
+
+    See Also
+    --------
+    results.InvertibleVolume : Has it as its certificate.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import nearest_invertible
+    >>> nearest_invertible(np.zeros((3, 3, 3, 3))).certificate.valid
+    True
+    """
 
     remaining: BoolArray
     bijective: bool
@@ -99,6 +111,21 @@ class InvertibleVolume(NearestField):
     distance : float
         Root mean square distance from the given field, over all voxels, in the field's unit.
     seconds : float
+
+    See Also
+    --------
+    nearest_invertible : Makes it from a field on voxels.
+    InvertibleField : The result for pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import nearest_invertible
+    >>> field = np.zeros((5, 5, 5, 3))
+    >>> field[2, 2, 2, 0] = 1.5
+    >>> result = nearest_invertible(field)
+    >>> result.success, result.folds > 0, int(result.remaining.sum())
+    (True, True, 0)
     """
 
     remaining: BoolArray
@@ -119,8 +146,10 @@ class InvertibleVolume(NearestField):
         left = int(np.count_nonzero(self.remaining))
         cells = f"{count_of('cell', 'cells', self.folds)} folded, {left} of them or their neighbours still do"
         moved = count_of("voxel", "voxels", int(np.count_nonzero(self.moved_mask)))
-        border = "" if self.bijective or left else " The surface of the grid crosses itself."
-        return f"{cells}; {moved} moved, root mean square change {self.distance:.3g}.{border}"
+        remedy = "" if self.bijective else " The surface of the grid crosses itself: fix the voxels there."
+        if left:
+            remedy = " Smooth the field there first, or fix fewer voxels."
+        return f"{cells}; {moved} moved, root mean square change {self.distance:.3g}.{remedy}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +162,19 @@ class InverseVolume:
         Displacement from the voxel at position q to its source ``q + field``; NaN for voxels without a source.
     outside : (d, h, w) bool
         Voxels outside the image of the given field.
+
+    See Also
+    --------
+    inverse_field : Makes it from a field on voxels.
+    InverseField : The inverse on pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import inverse_field
+    >>> back = inverse_field(np.full((3, 3, 3, 3), 1.0))
+    >>> back.field[1, 1, 1].tolist(), bool(back.outside[0, 0, 0])
+    ([-1.0, -1.0, -1.0], True)
     """
 
     field: FloatArray
@@ -327,7 +369,9 @@ def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
     grid, given, exponent = in_units(check_field(field), spacing)
     check_unfolded(find_folded_cells(grid, given, None))
     if _surface_crosses(grid, given):
-        raise ValueError("the field has no inverse: the surface of the grid crosses itself")
+        raise ValueError(
+            "the field has no inverse: the surface of the grid crosses itself; change the displacements there"
+        )
     back = np.full((int(np.prod(grid.shape)), 3), np.nan)
     best = np.full(len(back), -np.inf)
     X = (grid.positions(given) / grid.spacing).reshape(-1, 3)

@@ -164,6 +164,13 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
     TimeoutError
         If there is no bijective map within the time limit.
 
+    See Also
+    --------
+    injective_map : If the boundary has target positions.
+    keep_distances : Lowers the error of distances further.
+    unwrap : Any model, closed or with defects, into a texture.
+    quasiharmonic.atlas.flatten : Every island of a mesh with seams.
+
     Examples
     --------
     A cone without its tip, cut open, is isometric to a part of a ring:

@@ -34,7 +34,21 @@ _LINE_WIDTH = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Closed lines (k, 2) in millimetres; first points are not repeated."""
+    """Closed lines (k, 2) in millimetres; first points are not repeated.
+
+    See Also
+    --------
+    apps.flattening.patterns.pattern : Makes it.
+
+    Examples
+    --------
+    >>> from quasiharmonic.apps.flattening.patterns import pattern
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> lines = pattern(F, V, unit="cm")
+    >>> len(lines.seam), lines.seam[0].max(axis=0).tolist()
+    (1, [10.0, 10.0])
+    """
 
     seam: list[FloatArray]  # each (k, 2): boundary loops of the map, with the material on the left
     cut: list[FloatArray]  # each (k, 2): the seam with its allowance; the seam itself without allowance
@@ -66,6 +80,11 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
     ImportError
         If there is an allowance and Shapely is not installed.
 
+    See Also
+    --------
+    write_pattern : Writes the lines as a drawing.
+    flatten : Makes the map.
+
     Examples
     --------
     A square of 4 cm with 1 cm around it:
@@ -81,7 +100,10 @@ def pattern(F: ArrayLike, uv: ArrayLike, *, unit: str = "mm", allowance: float =
     positions = map_array("uv", uv)
     certificate = certify(F, positions)
     if not certificate.bijective:
-        raise ValueError(f"the map overlaps itself, so its pattern cannot be cut out. {certificate.summary()}")
+        raise ValueError(
+            f"the map overlaps itself, so its pattern cannot be cut out. {certificate.summary()} Flatten the surface "
+            f"again."
+        )
     with np.errstate(over="ignore"):
         seam = [positions[loop] * UNITS[unit] for loop in certificate.loops]
     if not all(np.isfinite(line).all() for line in seam):
@@ -115,6 +137,18 @@ def write_pattern(
         If a required package is not installed: ezdxf for DXF, Shapely for an allowance.
     quasiharmonic.io.OutputError
         If the file cannot be written.
+
+    See Also
+    --------
+    apps.flattening.patterns.pattern : Returns the lines.
+    flatten : Makes the map.
+
+    Examples
+    --------
+    >>> from quasiharmonic import write_pattern
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> write_pattern("square.svg", F, 40 * V)
     """
     check_pattern(path, unit=unit, allowance=allowance)
     lines = pattern(F, uv, unit=unit, allowance=allowance)

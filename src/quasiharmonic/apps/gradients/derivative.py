@@ -36,7 +36,22 @@ from quasiharmonic.util.arrays import (
 
 
 class Doubt(Enum):
-    """A reason why a derivative may differ from finite differences of the map; the value is a sentence for the user."""
+    """A reason why a derivative may differ from finite differences of the map; the value is a sentence for the user.
+
+    See Also
+    --------
+    Derivative : Lists them as ``doubts``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import Problem, boundary_loops, quasi_harmonic_derivative
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> quasi_harmonic_derivative(Problem(V, F, rim, V[rim])).doubts
+    ()
+    """
 
     NEAR_SINGULAR = (
         "The second derivative is singular up to rounding: maps next to this one are equally good, or a small change "
@@ -120,6 +135,21 @@ class Gradients:
         With respect to the rest positions.
     mu : (f,) complex128 or None
         With respect to the Beltrami coefficients, ``∂/∂Re μ + i ∂/∂Im μ``; None for maps without them.
+
+    See Also
+    --------
+    Derivative : Its method `vjp` returns them.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, boundary_loops, quasi_harmonic_derivative
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> derivative = quasi_harmonic_derivative(Problem(V, F, rim, V[rim]))
+    >>> gradients = derivative.vjp(derivative.uv)
+    >>> gradients.target.shape, gradients.rest.shape, gradients.mu.shape
+    ((24, 2), (61, 2), (96,))
     """
 
     _equilibrium: Equilibrium
@@ -172,6 +202,24 @@ class Derivative:
         certified as injective.
     doubts : tuple of Doubt
         Reasons not to rely on the derivative; usually empty.
+
+    See Also
+    --------
+    quasi_harmonic_derivative : Makes it.
+    polish_derivative : Makes it.
+    flatten_derivative : Makes it.
+    apps.gradients.Gradients : What `vjp` returns.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import Problem, boundary_loops, quasi_harmonic_derivative
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> derivative = quasi_harmonic_derivative(Problem(V, F, rim, V[rim]))
+    >>> derivative.reliable, derivative.jvp(target=np.ones((len(rim), 2))).shape
+    (True, (61, 2))
     """
 
     def __init__(self, uv: FloatArray, equilibrium: Equilibrium, doubts: Iterable[Doubt] = ()) -> None:

@@ -73,6 +73,12 @@ def quasi_harmonic_derivative(
     quasiharmonic.linsolve.NotPositiveDefinite
         If rounding makes the Laplacian not positive definite.
 
+    See Also
+    --------
+    quasi_harmonic_map : The map alone.
+    polish_derivative : The derivative of another map.
+    flatten_derivative : The derivative of another map.
+
     Notes
     -----
     The derivative uses the map's factor. All derivatives of one `Problem` share the memory of one factor, so
@@ -85,7 +91,7 @@ def quasi_harmonic_derivative(
     >>> V, F = disk(6)
     >>> rim = np.arange(len(V) - 36, len(V))
     >>> derivative = quasi_harmonic_derivative(Problem(V, F, rim, V[rim]))
-    >>> shifted = derivative.jvp(target=np.tile([1.0, 0.0], (36, 1)))  # the boundary moves, and everything with it
+    >>> shifted = derivative.jvp(target=np.tile([1.0, 0.0], (36, 1)))  # the whole map moves with its boundary
     >>> bool(np.allclose(shifted, [1, 0]))
     True
     """
@@ -165,6 +171,12 @@ def polish_derivative(
     ValueError
         As `quasiharmonic.polish`. If ``uv`` is not injective, it has no derivative.
 
+    See Also
+    --------
+    polish : The map alone.
+    quasi_harmonic_derivative : The derivative of another map.
+    flatten_derivative : The derivative of another map.
+
     Notes
     -----
     The method is implicit differentiation with the exact second derivative. A custom energy may depend on the rest
@@ -184,7 +196,7 @@ def polish_derivative(
     >>> V, F = disk(6)
     >>> rim = np.arange(len(V) - 36, len(V))
     >>> derivative = polish_derivative(V, F, polish(V, F, V, fixed=rim).uv, fixed=rim)
-    >>> gradients = derivative.vjp(derivative.uv)  # of half the sum of the squares of all places
+    >>> gradients = derivative.vjp(derivative.uv)  # of half the sum of the squares of all positions
     >>> gradients.target.shape, gradients.rest.shape, derivative.reliable
     ((36, 2), (127, 2), True)
     """
@@ -287,6 +299,12 @@ def flatten_derivative(
     ------
     ValueError
         As `quasiharmonic.flatten`. If there are several surfaces, or ``uv`` is not injective.
+
+    See Also
+    --------
+    flatten : The map alone.
+    quasi_harmonic_derivative : The derivative of another map.
+    polish_derivative : The derivative of another map.
 
     Examples
     --------

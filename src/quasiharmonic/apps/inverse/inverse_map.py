@@ -56,6 +56,19 @@ class SurfacePoints:
         Triangle that contains each point; -1 if there is no point.
     barycentric : (..., 3) float64
         Barycentric coordinates: weights of the triangle's corners that sum to 1. NaN if there is no point.
+
+    See Also
+    --------
+    InverseMap : Its method `locate` returns them.
+
+    Examples
+    --------
+    >>> from quasiharmonic import InverseMap
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> at = InverseMap(V, F, V).locate([[0.75, 0.25], [2.0, 0.0]])
+    >>> at.found.tolist(), int(at.triangle[1])
+    ([True, False], -1)
     """
 
     triangle: IntArray
@@ -94,6 +107,11 @@ class InverseMap(ReadOnly):
         As given, as float64 and int64.
     certificate : Certificate
         The exact certificate of the map.
+
+    See Also
+    --------
+    SurfaceMap : The map between two surfaces.
+    results.ChartInverse : The inverse of texture coordinates with seams.
 
     Notes
     -----
@@ -346,7 +364,7 @@ class InverseMap(ReadOnly):
 def _check(certificate: Certificate, overlapping: bool) -> None:
     """Raise ValueError if the map has no inverse."""
     if not certificate.injective:
-        raise ValueError(f"this map has no inverse. {certificate.summary()}")
+        raise ValueError(f"this map has no inverse. {certificate.summary()} Repair it first (repair; qhm repair).")
     if not (certificate.bijective or overlapping):
         raise ValueError(
             f"this map has no inverse. {certificate.summary()} "
@@ -378,6 +396,19 @@ class ChartInverse(InverseMap):
         As given.
     certificate : Certificate
         The exact certificate of the triangles that are not left out, turned to be counterclockwise.
+
+    See Also
+    --------
+    InverseMap : The inverse of a map without seams.
+
+    Examples
+    --------
+    >>> from quasiharmonic import unwrap
+    >>> from quasiharmonic.surfaces import starfish
+    >>> result = unwrap(*starfish(3, 4))
+    >>> corner = result.uvs[result.indices[0]].mean(axis=0)
+    >>> int(result.inverse().locate(corner).triangle)
+    0
     """
 
     def __init__(self, V: FloatArray, F: IntArray, uv: FloatArray, FT: IntArray, *, leave_out: IntArray) -> None:

@@ -41,6 +41,10 @@ class SurfaceMap:
         such as the unit square, can be the same. With other outlines, rounding and different boundary vertices leave
         a margin.
 
+    See Also
+    --------
+    InverseMap : Each of the two maps.
+
     Examples
     --------
     >>> import numpy as np

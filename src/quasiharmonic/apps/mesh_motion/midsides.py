@@ -106,7 +106,7 @@ def untangle_elements(F: IntArray, straight: FloatArray, searched: FloatArray, f
 
 
 def _untangle_near(F: IntArray, points: FloatArray, rings: int | None, fixed: IntArray) -> FloatArray:
-    """Move nodes within some rings of inverted elements; None moves only their mid-side nodes."""
+    """Move nodes within ``rings`` rings around inverted elements, or only the mid-side nodes of these if it is None."""
     near = inverted_elements(F, points)
     for _ in range(rings or 0):
         near = np.flatnonzero(np.isin(F[:, :3], F[near, :3]).any(axis=1))

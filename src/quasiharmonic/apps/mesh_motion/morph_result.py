@@ -45,6 +45,20 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         square, 0 without area, negative if inverted.
     points_before : (n, 2) float64
         All nodes before the morph.
+
+    See Also
+    --------
+    morph : Makes it.
+    TetrahedraResult : The result for tetrahedra.
+
+    Examples
+    --------
+    >>> from quasiharmonic import morph
+    >>> from quasiharmonic.surfaces import grid
+    >>> points, F = grid(4, 4)
+    >>> morphed = morph(points, F, [24], [[1.2, 1.3]])
+    >>> morphed.success, morphed.points[24].tolist(), morphed.inverted.tolist()
+    (True, [1.2, 1.3], [])
     """
 
     points: FloatArray
@@ -83,11 +97,14 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         qualities = self.describe_quality()
         if self.valid:
             return f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.\n{qualities}"
-        lines = [f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}."]
+        lines = [
+            f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}. Move the boundary less or in "
+            "several steps, and keep inner loops inside the outer loop."
+        ]
         if self.forbidden.size:
             lines.append(
-                f"Inverted for every position of the free nodes: {name_elements(self.F, self.forbidden)}. Move the "
-                "boundary less there, or split these elements."
+                f"Inverted for every position of the free nodes: {name_elements(self.F, self.forbidden)}. Split "
+                "these elements, or move their nodes less."
             )
         if not self.result.injective:
             lines.append(self.result.status.value)

@@ -126,6 +126,12 @@ def morph(
         If the input is malformed (see `Problem`), a moved node is in no element, or the rest mesh overlaps itself. If
         an element at rest has no area, or a quadrilateral at rest is not convex. The message names the elements.
 
+    See Also
+    --------
+    MovingMesh : Many small steps.
+    injective_tetrahedra : Tetrahedra with any fixed vertices.
+    warp_by_landmarks : Images.
+
     Notes
     -----
     Tetrahedra are untangled by a regularised energy, then the energy is lowered further. The search can fail although a
@@ -317,7 +323,7 @@ def _find_fixed(
     positions = map_array("target", target, len(given), finite=False)
     check_finite("target", "row", "rows", positions)
     idle = given[~np.isin(given, F)]
-    reject(idle, "vertex", "vertices", "moved_vertices refers to {}, but no triangle uses them")
+    reject(idle, "vertex", "vertices", "moved_vertices refers to {}, but no triangle uses them: omit them")
     left = np.setdiff1d(boundary_edges(covering_triangles(F)[0], len(points)), given)
     there = points.copy()
     there[given] = positions

@@ -179,6 +179,11 @@ class MovingMesh:
     ValueError
         If the input is malformed, a triangle has no area, or an option is invalid.
 
+    See Also
+    --------
+    morph : One large displacement.
+    AirMesh : Shapes that must not touch.
+
     Notes
     -----
     All tetrahedra stay positive, but separate parts of the boundary may be moved through each other. To detect this,

@@ -30,6 +30,17 @@ def element_quality(F: ArrayLike, points: ArrayLike) -> FloatArray:
     ------
     ValueError
         If an array has the wrong shape or dtype, ``F`` has indices out of range, or a node is not finite.
+
+    See Also
+    --------
+    geometry.exact.jacobian_signs.inverted_elements : Elements whose quality is not positive.
+    morph : Returns the quality before and after.
+
+    Examples
+    --------
+    >>> from quasiharmonic.apps.mesh_motion.quality import element_quality
+    >>> element_quality([[0, 1, 2, 3]], [[0, 0], [1, 0], [1, 1], [0, 1]]).tolist()
+    [1.0]
     """
     points = map_array("points", points)
     F = element_rows(F, len(points))

@@ -165,7 +165,10 @@ class IslandRepair:
         self._polish(self._restore(free) if keep else free)
         if not np.array_equal(free, ~self._fixed) and self._is_multiply_wound(free):
             self.uv = before
-            self.reason = "The maps found for a part of the island wind more than once around one of its vertices."
+            self.reason = (
+                "The maps found for a part of the island wind more than once around one of its vertices. Flatten the "
+                "island again."
+            )
 
     def _restore(self, moved: BoolArray) -> BoolArray:
         """Return vertices to their old positions where possible; return the mask of those that stay moved."""
@@ -222,11 +225,11 @@ class IslandRepair:
         corners = island.vertices[self._F]
         twice = np.flatnonzero((np.roll(corners, 1, axis=1) == corners).any(axis=1))
         if nowhere.size:
-            self.reason = (
-                f"No finite position for the boundary {names_of('vertex', 'vertices', island.vertices[nowhere])}."
-            )
+            which = names_of("vertex", "vertices", island.vertices[nowhere])
+            self.reason = f"No finite position for the boundary {which}. Give it one, or flatten the island again."
         elif twice.size:
-            self.reason = f"A vertex is used twice in {names_of('triangle', 'triangles', island.triangles[twice])}."
+            which = names_of("triangle", "triangles", island.triangles[twice])
+            self.reason = f"A vertex is used twice in {which}. Remove such triangles with clean."
         elif self._fixed[self._F[left]].all(axis=1).any():
             # Triangles with three boundary vertices belong to no patch.
             boundary = np.flatnonzero(self._fixed)

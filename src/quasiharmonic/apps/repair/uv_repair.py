@@ -51,6 +51,21 @@ class RepairedIsland(IslandReport):
         The obstruction to a map with this boundary, computed if triangles are still inverted.
     n_iterations : int
         Iterations of all searches and descents.
+
+    See Also
+    --------
+    RepairResult : Lists them as ``islands``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import repair
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> uv = V.copy()
+    >>> uv[0] = [0.4, 0.1]
+    >>> (island,) = repair(V, F, uv).islands
+    >>> len(island.inverted_before), len(island.inverted), island.moved_vertices.tolist()
+    (2, 0, [0])
     """
 
     inverted_before: IntArray
@@ -104,6 +119,20 @@ class RepairResult(SummarisedOutcome):
     mesh : SeamedMesh
         The surface with its new positions.
     seconds : float
+
+    See Also
+    --------
+    repair : Makes it.
+    results.RepairedIsland : The report of an island.
+
+    Examples
+    --------
+    >>> from quasiharmonic import repair
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> repaired = repair(V, F, V)
+    >>> repaired.success, len(repaired.islands), len(repaired.moved_vertices)
+    (True, 1, 0)
     """
 
     uv: FloatArray
@@ -152,6 +181,8 @@ class RepairResult(SummarisedOutcome):
             f"{count_of('triangle', 'triangles', before)} inverted before, {now} now; "
             f"{count_of('vertex', 'vertices', len(self.moved_vertices))} moved"
         ]
+        if now:
+            lines[0] += "; move the boundary of the islands listed, or flatten these islands again"
         return "\n".join(lines + [f"- {i.summary()}" for i in self.islands if i.inverted_before.size or i.mirrored])
 
     def _count_inverted(self) -> tuple[int, int]:
@@ -233,6 +264,12 @@ def repair(
     KeyboardInterrupt
         By Ctrl-C.
 
+    See Also
+    --------
+    injective_map : Maps the surface again.
+    inverted_triangles : Lists inverted triangles.
+    polish : Lowers the distortion afterwards.
+
     Examples
     --------
     >>> from quasiharmonic.surfaces import disk
@@ -294,5 +331,7 @@ def _report_mirrored(island: Island, turn: bool) -> tuple[FloatArray, RepairedIs
         moved_vertices=np.unique(island.vertices) if turn else none,
         mirrored=True,
         bijective=bool(certificate.bijective),
-        reason="Double precision cannot express it the other way around." if wrong.size else "",
+        reason="Double precision cannot express its reflection. Move the map nearer to the origin."
+        if wrong.size
+        else "",
     )

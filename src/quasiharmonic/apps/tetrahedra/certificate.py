@@ -73,6 +73,18 @@ class TetrahedraCertificate(ReadOnly, Verdict):
         computed if the mesh meets the other conditions.
     injective : bool or None
         Whether no two points of the mesh have the same position; None if the boundary was not checked.
+
+    See Also
+    --------
+    certify_tetrahedra : Makes it.
+    Certificate : The verdict on triangles.
+
+    Examples
+    --------
+    >>> from quasiharmonic import certify_tetrahedra
+    >>> certificate = certify_tetrahedra([[0, 2, 1, 3]], [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    >>> certificate.valid, certificate.inverted.tolist()
+    (False, [0])
     """
 
     tetrahedra: int
@@ -192,6 +204,11 @@ def certify_tetrahedra(T: ArrayLike, X: ArrayLike, *, boundary: bool = True) -> 
     ------
     ValueError
         If an array has the wrong shape or dtype, or ``T`` has indices out of range.
+
+    See Also
+    --------
+    injective_tetrahedra : Searches for positive tetrahedra.
+    certify : Checks triangles.
 
     Notes
     -----

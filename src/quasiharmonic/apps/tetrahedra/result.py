@@ -29,20 +29,45 @@ _Vector = list[Fraction]
 
 
 class TetrahedraStatus(Enum):
-    """Why a search ended; the value is a message for the user."""
+    """Why a search ended; the value is a message for the user with the outcome and the next action.
+
+    See Also
+    --------
+    TetrahedraResult : Has a status, and the message of it.
+    Status : The statuses of maps of triangles.
+
+    Examples
+    --------
+    >>> from quasiharmonic.apps.tetrahedra.result import TetrahedraStatus
+    >>> TetrahedraStatus.POLISHED.value
+    'Every tetrahedron is strictly positive, and the distortion has converged.'
+    """
 
     POLISHED = "Every tetrahedron is strictly positive, and the distortion has converged."
-    STILL_FALLING = "Every tetrahedron is strictly positive. The distortion was still falling after the last iteration."
+    STILL_FALLING = (
+        "Every tetrahedron is strictly positive. The distortion was still falling after the last iteration: "
+        "allow more iterations to lower it further."
+    )
     FIRST_VALID = "Every tetrahedron is strictly positive."
     STALLED = (
         "Stalled: some tetrahedra are still inverted and further iterations do not help. No known obstruction forbids "
-        "a valid mesh, but this mesh and this target may still allow none."
+        "a valid mesh, but this mesh and this target may still allow none. Move the boundary less, move it in several "
+        "steps, or split the edges of the inverted tetrahedra."
     )
     OUT_OF_ITERATIONS = "Some tetrahedra were still inverted after the last iteration: allow more iterations."
-    OVERLAPPING = "Every tetrahedron is strictly positive, but the mesh overlaps itself: points are covered twice."
-    INTERRUPTED = "Interrupted. This is the best mesh so far."
-    IMPOSSIBLE = "No valid mesh with these fixed vertices exists. The obstructions are listed."
-    CROSSING = "The boundary crosses itself at its target positions, so no valid mesh exists. Nothing was computed."
+    OVERLAPPING = (
+        "Every tetrahedron is strictly positive, but the mesh overlaps itself: points are covered twice. Move apart "
+        "the parts of the boundary that the certificate lists."
+    )
+    INTERRUPTED = "Interrupted. This is the best mesh so far: use it as the initial mesh of a new call to continue."
+    IMPOSSIBLE = (
+        "No valid mesh with these fixed vertices exists. Move the vertices that the obstructions list, or split the "
+        "edges there."
+    )
+    CROSSING = (
+        "The boundary crosses itself at its target positions, so no valid mesh exists, and nothing was computed. Move "
+        "apart the triangles that the obstructions list."
+    )
 
 
 @dataclass(frozen=True)
@@ -54,6 +79,20 @@ class TetrahedraObstruction:
     text : str
     vertices : tuple of int
         The vertices of the tetrahedron, edge or triangles, or the free vertex.
+
+    See Also
+    --------
+    TetrahedraResult : Lists them as ``obstructions``.
+    results.Obstruction : The same for triangles.
+
+    Examples
+    --------
+    >>> from quasiharmonic import injective_tetrahedra
+    >>> X = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    >>> reflected = [[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1]]
+    >>> result = injective_tetrahedra(X, [[0, 1, 2, 3]], range(4), reflected)
+    >>> result.obstructions[0].vertices
+    (0, 1, 2, 3)
     """
 
     text: str
@@ -88,6 +127,22 @@ class TetrahedraResult(Outcome, Displayable):
         `tetrahedron_quality` of every tetrahedron.
     points_before : (n, 3) float64
         All vertices before the morph.
+
+    See Also
+    --------
+    injective_tetrahedra : Makes it.
+    morph : Makes it.
+    apps.tetrahedra.result.TetrahedraStatus : What each status means.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import injective_tetrahedra
+    >>> X = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.2, 0.2, 0.2]])
+    >>> T = [[0, 1, 2, 4], [0, 1, 3, 4], [0, 2, 3, 4], [1, 2, 3, 4]]
+    >>> result = injective_tetrahedra(X, T, range(4), 2.0 * X[:4])
+    >>> result.status.name, result.certificate.injective, bool(result.quality_after.min() > 0)
+    ('POLISHED', True, True)
     """
 
     points: FloatArray
@@ -129,7 +184,7 @@ class TetrahedraResult(Outcome, Displayable):
         lines = [self.status.value, self.certificate.summary()]
         if self.forbidden.size:
             which = names_of("tetrahedron", "tetrahedra", self.forbidden)
-            lines.append(f"Inverted or degenerate with four fixed vertices: {which}.")
+            lines.append(f"Inverted or degenerate with four fixed vertices: {which}. Move these vertices less.")
         lines += [obstruction.text for obstruction in self.obstructions[:5]]
         return "\n".join([*lines, self.describe_quality()])
 

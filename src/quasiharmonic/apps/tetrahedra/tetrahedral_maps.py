@@ -76,6 +76,11 @@ def injective_tetrahedra(
         If an argument is malformed or not finite, or a tetrahedron at rest is degenerate, repeated, or overlaps a
         neighbour. The message names the elements.
 
+    See Also
+    --------
+    morph : Moves some nodes of a mesh.
+    certify_tetrahedra : Checks a mesh.
+
     Notes
     -----
     The search can fail although a map exists. A boundary that crosses itself is reported before any search.
@@ -98,8 +103,15 @@ def injective_tetrahedra(
 
 
 def is_volume(points: ArrayLike, cells: ArrayLike) -> bool:
-    """Whether points are in space, and cells are not triangles."""
-    return np.ndim(points) == 2 and np.shape(points)[1] == 3 and np.ndim(cells) == 2 and np.shape(cells)[1] != 3
+    """Whether points are in space, and cells are not triangles; ValueError for triangles in space."""
+    if np.ndim(points) != 2 or np.shape(points)[1] != 3 or np.ndim(cells) != 2:
+        return False
+    if np.shape(cells)[1] == 3:
+        raise ValueError(
+            f"points must have shape (n, 2) for triangles, not {np.shape(points)}: for a planar mesh pass "
+            "points[:, :2]; tetrahedra need F of shape (f, 4)"
+        )
+    return True
 
 
 def morph_tetrahedra(
@@ -131,7 +143,7 @@ def find_fixed(
 ) -> tuple[IntArray, IntArray, Sliding]:
     """Return the moved vertices, checked, the boundary vertices that neither move nor slide, and those that slide."""
     moved = vertex_indices("moved_vertices", moved_vertices, len(points))
-    reject(np.bincount(moved) > 1, "vertex", "vertices", "{} moved more than once")
+    reject(np.bincount(moved) > 1, "vertex", "vertices", "{} moved more than once: list each vertex once")
     idle = moved[~np.isin(moved, mesh.T)]
     reject(idle, "vertex", "vertices", "moved_vertices refers to {}, in no tetrahedron")
     sliding = find_sliding(mesh.faces.boundary, points, moved, slide)

@@ -42,6 +42,19 @@ class UnwrapCertificate(Verdict):
     clearance : float
         Smallest distance between two charts, in texels, in double precision; infinite if it exceeds the padding by
         more than half.
+
+    See Also
+    --------
+    unwrap : Makes it.
+    quasiharmonic.atlas.certify : The verdict on other texture coordinates.
+
+    Examples
+    --------
+    >>> from quasiharmonic import unwrap
+    >>> from quasiharmonic.surfaces import starfish
+    >>> certificate = unwrap(*starfish(3, 4)).certificate
+    >>> certificate.bijective, bool(certificate.bijective_charts.all()), certificate.clearance >= 4
+    (True, True, True)
     """
 
     bijective_charts: BoolArray
@@ -130,7 +143,7 @@ def certify_charts(
         inverted=np.sort(triangles[whole.inverted]),
         degenerate=np.sort(triangles[np.concatenate([whole.degenerate, whole.nonfinite])]),
         overlapping=overlapping,
-        clearance=_clearance(whole.loops, uv * size, chart_of_vertex, 1.5 * padding),
+        clearance=measure_clearance(whole.loops, uv * size, chart_of_vertex, 1.5 * padding),
     )
 
 
@@ -171,7 +184,7 @@ def _find_faults(
     return good, np.array(sound, dtype=np.int64).reshape(-1, 2)
 
 
-def _clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vertex: IntArray, reach: float) -> float:
+def measure_clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vertex: IntArray, reach: float) -> float:
     """Return the smallest distance between boundaries of different charts; infinity if it exceeds ``reach``."""
     if len(loops) < 2:
         return np.inf

@@ -319,7 +319,7 @@ def _finish(charts: list[WorkingChart], bound: float, total: float) -> list[Char
 
 
 def _excess(chart: WorkingChart, bound: float, kept: bool) -> float:
-    """How much a chart misses the bound; ``kept`` says that all charts together keep the bound on 99 %."""
+    """Return by how much a chart exceeds the bound; ``kept`` says that all charts together keep the bound on 99 %."""
     missed = 0.0
     if not kept:
         order = np.argsort(chart.stretch, kind="stable")

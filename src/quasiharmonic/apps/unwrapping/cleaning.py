@@ -86,6 +86,19 @@ class CleanedMesh:
         triangles; see `MeshReport`.
     representatives : (n,) int64
         For each vertex of the model the one with which it was merged, which has the lowest index; otherwise itself.
+
+    See Also
+    --------
+    clean : Makes it.
+    MeshReport : The defects of the model.
+
+    Examples
+    --------
+    >>> from quasiharmonic import clean
+    >>> V = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    >>> cleaned = clean(V, [[0, 1, 2], [0, 2, 3], [0, 1, 2]])
+    >>> cleaned.triangles.tolist(), cleaned.excluded.tolist(), cleaned.repeated.tolist()
+    ([0, 1], [2], [True])
     """
 
     V: FloatArray
@@ -212,6 +225,11 @@ def clean(
     ValueError
         If an array has the wrong shape, a position is not finite, an index is out of range, there are no triangles, or
         all triangles are degenerate. Also if ``weld`` is negative or not finite.
+
+    See Also
+    --------
+    inspect_mesh : Lists the defects.
+    unwrap : Cleans the model itself.
 
     Examples
     --------

@@ -80,7 +80,7 @@ def mend_charts(
 def _divide(
     chart: Chart, verdict: Certificate, low: BoolArray, V: FloatArray, cost: FloatArray, bound: float
 ) -> list[Chart]:
-    """Divide a chart such that what is wrong in the texture is apart from the rest; ``low`` (k,) may become wrong."""
+    """Divide a chart so that triangles with faults are in charts of their own; ``low`` (k,) are triangles at risk."""
     bad = np.zeros(len(chart.F), dtype=bool)
     bad[verdict.inverted], bad[verdict.degenerate] = True, True
     bad |= np.isin(chart.F, verdict.multiply_wound).any(axis=1)

@@ -112,7 +112,7 @@ class _Parts:
         self.rough = rough > _ROUGH * np.bincount(part[corner], minlength=self.count)
 
     def find_cut(self, hinges: Hinges, k: int, here: IntArray, cost: FloatArray) -> IntArray:
-        """Return which of the hinges ``here`` of part ``k`` to cut, at a cost, to get a disk without apex inside."""
+        """Return the cheapest cut among hinges ``here`` of part ``k`` that gives a disk, its apexes on the boundary."""
         rows = np.flatnonzero(self.component == k)
         names, own = np.unique(self.split[rows], return_inverse=True)
         loops = boundary_loops(own.reshape(-1, 3), len(names))

@@ -16,9 +16,11 @@ from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
 from quasiharmonic.io.adapters.objects import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, find_exponent, names_of
+from quasiharmonic.util.display import Displayable
 from quasiharmonic.util.outcome import Outcome
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from trimesh import Trimesh
 
     from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
@@ -28,7 +30,21 @@ _LISTED = 5
 
 
 class UnwrapStatus(Enum):
-    """How `unwrap` ended; the value is a message for the user with the outcome and the next action."""
+    """How `unwrap` ended; the value is a message for the user with the outcome and the next action.
+
+    See Also
+    --------
+    UnwrapResult : Has a status, and the message of it.
+    Status : The statuses of other maps.
+
+    Examples
+    --------
+    >>> from quasiharmonic import unwrap
+    >>> from quasiharmonic.results import UnwrapStatus
+    >>> from quasiharmonic.surfaces import starfish
+    >>> unwrap(*starfish(3, 4)).status is UnwrapStatus.UNWRAPPED
+    True
+    """
 
     UNWRAPPED = "Every chart is bijective and no two charts overlap, verified exactly. The stretch is within the bound."
     STRETCHED = (
@@ -62,6 +78,19 @@ class Stretch(NamedTuple):
     median, p99, worst : float
         Half and 99 % of the surface are stretched by at most this factor, and the maximum over all triangles. NaN if
         all triangles are too thin to be measured.
+
+    See Also
+    --------
+    UnwrapResult : Has the stretch of all charts.
+    distortion : Other measures, for each triangle.
+
+    Examples
+    --------
+    >>> from quasiharmonic import unwrap
+    >>> from quasiharmonic.surfaces import starfish
+    >>> stretch = unwrap(*starfish(3, 4)).stretch
+    >>> bool(1 <= stretch.median <= stretch.p99 <= stretch.worst)
+    True
     """
 
     median: float
@@ -80,6 +109,18 @@ class Miss(NamedTuple):
     excess : float
         The larger of two differences: between the 99 % quantile and ``max_stretch``, and between the worst stretch, of
         triangles without an angle below 1°, and 3.
+
+    See Also
+    --------
+    UnwrapResult : Lists them as ``misses``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import unwrap
+    >>> from quasiharmonic.surfaces import starfish
+    >>> result = unwrap(*starfish(3, 4), max_stretch=1.001, max_charts=1)
+    >>> len(result.misses) > 0, bool(result.misses[0].excess > 0)
+    (True, True)
     """
 
     chart: int
@@ -97,6 +138,19 @@ class UnwrapStep(NamedTuple):
         which can repeat, then ``"pack"`` and ``"certify"``.
     done, total : int
         Finished parts of the phase, and all parts.
+
+    See Also
+    --------
+    unwrap : Passes it to its callback.
+
+    Examples
+    --------
+    >>> from quasiharmonic import unwrap
+    >>> from quasiharmonic.surfaces import starfish
+    >>> phases = []
+    >>> result = unwrap(*starfish(3, 4), callback=lambda step: phases.append(step.phase))
+    >>> phases[0], phases[-1]
+    ('clean', 'certify')
     """
 
     phase: str
@@ -105,7 +159,7 @@ class UnwrapStep(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class UnwrapResult(Outcome):
+class UnwrapResult(Outcome, Displayable):
     """Texture coordinates of a model, made by `unwrap`; iterates as ``vmapping, indices, uvs``.
 
     Attributes
@@ -155,6 +209,20 @@ class UnwrapResult(Outcome):
         bound there; they are more than necessary. Empty if the limit did not end the search.
     source : object
         The mesh of trimesh that was given; None for other meshes.
+
+    See Also
+    --------
+    unwrap : Makes it.
+    bake : Bakes textures for it.
+    results.UnwrapStatus : What each status means.
+
+    Examples
+    --------
+    >>> from quasiharmonic import unwrap
+    >>> from quasiharmonic.surfaces import starfish
+    >>> result = unwrap(*starfish(3, 12))
+    >>> result.status.name, len(result.misses), bool(result.stretch.p99 <= 1.5)
+    ('UNWRAPPED', 0, True)
     """
 
     vmapping: IntArray
@@ -221,6 +289,20 @@ class UnwrapResult(Outcome):
         material and its metadata are kept.
         """
         return make_trimesh(self.V[self.vmapping], self.indices, self.uvs, like=self.source, rows=self.vmapping)
+
+    def plot(self) -> Figure:
+        """Draw the charts, and the model with a checkerboard, the stretch and the texel density.
+
+        Returns
+        -------
+        matplotlib Figure
+            Triangles whose orientation differs from that of their chart are red.
+        """
+        return self._draw("unwrap")
+
+    def short_repr(self) -> str:
+        """Return the outcome in a sentence."""
+        return self.message
 
     def summary(self) -> str:
         """Return charts, seams, stretch and utilisation in a few lines."""

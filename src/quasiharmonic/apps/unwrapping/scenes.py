@@ -200,7 +200,7 @@ class AcceptsScene(Protocol[P]):
 def accepts_scene(function: AcceptsMesh[P, UnwrapResult]) -> AcceptsScene[P]:
     """Decorate `unwrap` so that it accepts a list of meshes, or a scene of trimesh, in place of ``V`` and ``F``.
 
-    The meshes of a file with several are told apart, and a mesh of trimesh is kept for `UnwrapResult.to_trimesh`.
+    The meshes of one file are distinguished, and a mesh of trimesh is kept for `UnwrapResult.to_trimesh`.
     """
     called: Callable[..., Any] = function
 

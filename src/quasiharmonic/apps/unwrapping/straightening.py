@@ -44,6 +44,20 @@ class Strip(NamedTuple):
         Largest stretch as a rectangle.
     straightened : bool
         Whether it became a rectangle; not if that stretches a triangle beyond the bound, or needs too many charts.
+
+    See Also
+    --------
+    UnwrapResult : Lists them as ``strips``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import unwrap
+    >>> from quasiharmonic.surfaces import grid
+    >>> flat, F = grid(8, 4)
+    >>> V = np.column_stack([np.cos(2 * flat[:, 0]), np.sin(2 * flat[:, 0]), flat[:, 1] + 0.1 * flat[:, 0] ** 2])
+    >>> [(strip.columns, strip.rows) for strip in unwrap(V, F, straighten=True).strips]
+    [(8, 4)]
     """
 
     triangle: int

@@ -112,8 +112,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Any triangles. Degenerate and repeated triangles get the texture coordinates of a neighbour. Surfaces are cut at
         edges of three or more triangles and where they cannot be oriented; see `clean`.
     max_stretch : float
-        Bound on the stretch max(σ₁, 1/σ₂), at least 1. 99 % of the surface keep it. No triangle is stretched by more
-        than 3, except triangles with an angle below 1°. Lower values need more seams.
+        Bound on the stretch max(σ₁, 1/σ₂) at 99 % of the surface, at least 1. No triangle may be stretched by more than
+        3, except triangles with an angle below 1°. Lower values need more seams. `UnwrapResult.misses` lists the charts
+        that exceed the bound.
     max_charts : int, optional
         Maximum number of charts. It is exceeded only by connected parts, and by parts that have no bijective map
         otherwise.
@@ -149,8 +150,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     meshes : (n,) array of int, optional
         Mesh of each vertex, if ``V`` and ``F`` are several meshes. Vertices of different meshes are not welded.
     instances : str
-        Whether a mesh that is several times in the list or the scene has texture coordinates that all share
-        (``"share"``), at the density of the largest, or each has a place of its own (``"own"``).
+        For a mesh that occurs several times in the list or the scene: with ``"share"``, all occurrences share their
+        texture coordinates, at the density of the largest; with ``"own"``, each occurrence has its own.
     weights : sequence or mapping of float, optional
         Factors on the texel density: one for each mesh of a list, or by names of the meshes of a scene.
     hard_edges : float, (k, 2) array of int, or "file", optional
@@ -160,9 +161,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     symmetry : str or None
         Axis normal to the plane of symmetry, ``"x"``, ``"y"`` or ``"z"``; ``"auto"`` takes the first one that fits.
         Seams and charts are mirrored if every vertex has a mirror image, to 1e-6 of the diagonal of the model's box,
-        and every triangle. Curved parts are not if triangles of theirs cross the plane, or if their seams would be
-        much longer. `UnwrapResult.symmetry` says what was done. Without effect if ``uv`` is given, and ``"auto"`` also
-        with ``edge_costs``, ``seams``, ``no_seams`` or ``labels``.
+        and every triangle. Curved parts are not mirrored if their triangles cross the plane, or if their seams would
+        be much longer. `UnwrapResult.symmetry` says what was done. No effect if ``uv`` is given; ``"auto"`` also with
+        ``edge_costs``, ``seams``, ``no_seams`` or ``labels``.
     up : str, optional
         Direction that points up: ``"x"``, ``"y"``, ``"z"``, ``"-x"``, ``"-y"`` or ``"-z"``. Seams then cost a tenth
         less where the surface faces down, and a tenth less in concave edges. By default visibility has no influence.
@@ -170,12 +171,12 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         Flat and developable parts are joined across edges, for fewer charts and shorter seams, as long as the estimated
         share of the texture that they use falls by at most this value below the best one.
     divide_for_packing : bool
-        Whether flat and developable parts are also divided where the texture is used better then. By default, they are
-        divided only where they are longer than the texture's side.
+        Whether flat and developable parts are also divided where this saves texture. By default, they are divided only
+        where they are longer than the texture's side.
     straighten : bool
         Whether strips become rectangles: curved parts that are regular grids of quadrilaterals, or tubes of these, each
         quadrilateral made of two triangles. A strip ends at edges of the surface, at creases or at demanded seams.
-        Strips of which a triangle would be stretched beyond the bound stay as they are (`UnwrapResult.strips`).
+        A strip stays unchanged if a triangle of it would be stretched beyond the bound (`UnwrapResult.strips`).
     edge_costs : (f, 3) array, optional
         Positive factor on the cost of a seam at each side of each triangle, from corner 0 to 1, 1 to 2 and 2 to 0.
         Large values keep seams away from visible parts. Values of at least 1,000 keep two triangles together where
@@ -220,6 +221,13 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         The message names the elements. Also if pairs in ``seams`` or ``no_seams`` are no edges of the mesh, are in both
         lists, or cannot be kept. If the texture is too small for the padding of all charts, the message states the
         smallest sufficient resolution, or with ``faces`` a sufficient texel density.
+
+    See Also
+    --------
+    flatten : One surface with a boundary, without a texture.
+    bake : The look of the model for the new texture coordinates.
+    clean : The surfaces that a model with defects forms.
+    quasiharmonic.atlas.pack_charts : Places charts that exist.
 
     Examples
     --------

@@ -54,7 +54,7 @@ def read_wanted_seams(seams: ArrayLike | None, no_seams: ArrayLike | None, F: In
     must, must_not = read_edges("seams", seams, F, joint), read_edges("no_seams", no_seams, F, joint)
     both = must[np.isin(pair_keys(must, len(joint)), pair_keys(must_not, len(joint)))]
     if len(both):
-        raise ValueError(f"{edge_names(both)}: both in seams and in no_seams")
+        raise ValueError(f"{edge_names(both)}: both in seams and in no_seams: remove them from one of the lists")
     return WantedSeams(must, must_not)
 
 

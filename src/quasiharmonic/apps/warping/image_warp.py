@@ -48,6 +48,21 @@ class WarpResult(OutcomeOf):
         Warped positions of the vertices.
     result : MapResult
         The map with its certificate. The warp is injective if its certificate is bijective.
+
+    See Also
+    --------
+    warp_by_landmarks : Makes it.
+    warp_along : Warps further images with its map.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import warp_along, warp_by_landmarks
+    >>> image = np.random.default_rng(0).random((20, 30))
+    >>> warped = warp_by_landmarks(image, [[15, 10]], [[18, 10]], resolution=12)
+    >>> again = warp_along(image, warped.points, warped.F, warped.positions)
+    >>> warped.success, bool((again == warped.image).all())
+    (True, True)
     """
 
     image: NDArray[Any]
@@ -114,6 +129,11 @@ def warp_by_landmarks(
     KeyboardInterrupt
         If Ctrl-C ends the search before there is an injective warp. After that, the result is the best warp so far.
 
+    See Also
+    --------
+    warp_along : Warps with a given map.
+    nearest_invertible : Removes folds of a displacement field.
+
     Examples
     --------
     >>> import numpy as np
@@ -148,7 +168,9 @@ def warp_by_landmarks(
     if interrupted and not result.injective:
         raise KeyboardInterrupt
     if result.certificate.crossings.size:
-        raise ValueError("target: the border, moved by the landmarks on it, crosses itself")
+        raise ValueError(
+            "target: the border, moved by the landmarks on it, crosses itself: move them less, or keep their order"
+        )
     if not result.injective:
         raise RuntimeError(
             "no warp without folds was found: landmarks may move too far past each other or past the border. "
@@ -189,6 +211,19 @@ def warp_along(
     ValueError
         If an array has the wrong shape, a point is not finite, or the map is not bijective; the message gives the
         reason.
+
+    See Also
+    --------
+    warp_by_landmarks : Finds the map, too.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import warp_along
+    >>> image = np.arange(6.0).reshape(2, 3)
+    >>> points, F = [[0, 0], [2, 0], [2, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]]
+    >>> warp_along(image, points, F, np.add(points, [1, 0]), shape=(2, 4)).tolist()
+    [[0.0, 0.0, 1.0, 2.0], [0.0, 3.0, 4.0, 5.0]]
     """
     from scipy.ndimage import map_coordinates
 

@@ -66,7 +66,9 @@ def make_landmarks(
     if np.array_equal(before[edge], after[edge]):
         _check_inside("target", after, ((after > 0) & (after < size)).all(axis=1) | edge, size)
     soft = edge & ~np.isinf(weight)
-    reject(soft, "landmark", "landmarks", "weights: {} on the border, where landmarks are exact")
+    reject(
+        soft, "landmark", "landmarks", "weights: {} on the border, where landmarks are exact: give them infinite weight"
+    )
     _check_apart("landmarks", before)
     _check_apart("target", after[np.isinf(weight)], np.flatnonzero(np.isinf(weight)))
     check_sequence("curves", curves, "pairs of polylines")
@@ -114,7 +116,8 @@ def _check_apart(name: str, array: FloatArray, numbers: IntArray | None = None) 
         same = np.flatnonzero((array == place).all(axis=1))
         which = same if numbers is None else numbers[same]
         raise ValueError(
-            f"{name}: {names_of('point', 'points', which)} have the same position, {tuple(place.tolist())}"
+            f"{name}: {names_of('point', 'points', which)} have the same position, {tuple(place.tolist())}: keep one "
+            f"of them"
         )
 
 
@@ -129,7 +132,7 @@ def _resample(start: ArrayLike, end: ArrayLike, name: str, step: float) -> tuple
         check_finite(name, "point", "points", line)
     arcs = [np.append(0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))) for line in lines]
     if min(arc[-1] for arc in arcs) == 0:
-        raise ValueError(f"{name} has no length")
+        raise ValueError(f"{name} has no length: give at least two different points")
     parts = np.linspace(0, 1, int(np.ceil(max(arc[-1] for arc in arcs) / step)) + 1)
     one, other = (
         np.stack([np.interp(parts * arc[-1], arc, line[:, axis]) for axis in (0, 1)], axis=1)

@@ -42,7 +42,7 @@ class ReweightedDirichlet(SymmetricDirichlet):
 
     @classmethod
     def at(cls, mean: float) -> ReweightedDirichlet:
-        """Energy with the aim suited to a mean energy: the distance of an average triangle, ``σ⁻² = mean``."""
+        """Return the energy whose aim is ``√mean``, that of a triangle with the mean energy, within bounds."""
         return cls(min(max(mean**0.5, MIN_AIM), MAX_AIM))
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:

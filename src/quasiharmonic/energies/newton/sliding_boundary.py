@@ -276,7 +276,7 @@ class SlidingModel(MapModel):
     def restrict(
         self, state: NewtonState, gradient: ComplexArray, direction: ComplexArray, expected_decrease: float
     ) -> tuple[ComplexArray, float]:
-        """Keep vertices at kinks whose direction leads to the other side."""
+        """Set the direction to zero at vertices at a kink if it leads to the other side of the kink."""
         assert self._frame is not None
         at = self.system.at
         wrong = direction[at].real * self._frame.side < 0

@@ -37,6 +37,18 @@ class Arc:
         Axes. If they are orthogonal and of equal length, the arc is circular.
     first, last : float
         Angles in radians. The arc runs clockwise if ``last`` is smaller.
+
+    See Also
+    --------
+    geometry.curves.Curve : Made of arcs and other pieces.
+
+    Examples
+    --------
+    >>> import math
+    >>> from quasiharmonic.geometry.curves import Arc, Curve
+    >>> half = Curve([Arc((0, 0), (1, 0), (0, 1), 0, math.pi)])
+    >>> half.closed, round(half.length, 6)
+    (False, 3.141593)
     """
 
     centre: ArrayLike

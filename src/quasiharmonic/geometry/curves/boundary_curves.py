@@ -64,6 +64,12 @@ class BoundaryCurves:
     ValueError
         If there is no curve, a curve is not valid (see `Curve`), or a number is out of range.
 
+    See Also
+    --------
+    polish : Takes the curves.
+    morph : Takes the curves.
+    geometry.curves.Curve : One curve.
+
     Examples
     --------
     Vertices on the boundary of a disk may slide around the circle. On a square, vertices slide along the sides:

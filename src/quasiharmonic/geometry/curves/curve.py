@@ -82,6 +82,11 @@ class Curve:
     size : float
         Larger side of the bounding box.
 
+    See Also
+    --------
+    BoundaryCurves : Curves along which boundary vertices slide.
+    geometry.curves.Arc : A piece of a curve.
+
     Examples
     --------
     >>> import numpy as np

@@ -88,6 +88,11 @@ class Certificate(ReadOnly, Displayable, Verdict):
         Vertices with only positive triangles around them whose angles add up to more than 2π. At an interior vertex the
         triangles wind more than once; at a boundary vertex the two ends of the fan overlap. See the notes.
 
+    See Also
+    --------
+    certify : Makes it.
+    TetrahedraCertificate : The verdict on tetrahedra.
+
     Notes
     -----
     Suppose all triangles around a vertex are positive. At an interior vertex the sum of their angles is a multiple of
@@ -95,6 +100,13 @@ class Certificate(ReadOnly, Displayable, Verdict):
     and only if the sum is less than 2π. A sum of exactly 2π means that the two boundary edges lie on each other. Then
     `crossings` lists them, and `multiply_wound` does not contain the vertex. The test is exact. `multiply_wound` is
     empty if the boundary was not checked (`bijective` is None) or if the mesh is not a surface.
+
+    Examples
+    --------
+    >>> from quasiharmonic import certify
+    >>> certificate = certify([[0, 1, 2], [0, 2, 3]], [[0, 0], [1, 0], [1, 1], [0.9, 0.5]])
+    >>> certificate.injective, certificate.inverted.tolist()
+    (False, [1])
     """
 
     F: IntArray

@@ -53,6 +53,18 @@ def inverted_elements(F: ArrayLike, points: ArrayLike) -> IntArray:
     ------
     ValueError
         If an array has the wrong shape or dtype, or ``F`` refers to nodes that do not exist.
+
+    See Also
+    --------
+    inverted_triangles : The same for maps of triangles.
+    apps.mesh_motion.quality.element_quality : The quality of each element.
+    certify_tetrahedra : Checks tetrahedra.
+
+    Examples
+    --------
+    >>> from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
+    >>> inverted_elements([[0, 1, 2, 3]], [[0, 0], [1, 0], [0.1, 0.1], [0, 1]]).tolist()
+    [0]
     """
     points = map_array("points", points, finite=False)
     F = element_rows(F, len(points))

@@ -120,7 +120,7 @@ def sure_orientation(a: FloatArray, b: FloatArray, c: FloatArray) -> SignArray:
 def _sign_if_certain(
     ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray, cx: FloatArray, cy: FloatArray
 ) -> SignArray:
-    """Sign of the orientation where floating point is certain of it; 0 elsewhere."""
+    """Sign of the orientation where rounding cannot change it; 0 elsewhere."""
     left = (ax - cx) * (by - cy)
     right = (ay - cy) * (bx - cx)
     det = left - right

@@ -65,7 +65,7 @@ def element_array(F: ArrayLike, n: int) -> IntArray:
     if array.shape[1] == 4:
         twice |= (array[:, 3:] == array[:, :2]).any(axis=1)
     if twice.any():
-        raise ValueError(f"{name_elements(array, np.flatnonzero(twice))} with a node twice")
+        raise ValueError(f"{name_elements(array, np.flatnonzero(twice))} with a node twice: remove them")
     if array.shape[1] == 6:
         _check_middles(array)
     return array

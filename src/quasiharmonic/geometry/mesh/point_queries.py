@@ -54,7 +54,7 @@ class NearestPoint:
         """Return the centres of the parts, by their numbers, of triangles whose sides are divided evenly."""
         row = np.floor(np.sqrt(number)).astype(np.int64)
         along = number - row**2
-        # Row r has 2 r + 1 parts, which are upright and inverted by turns.
+        # Row r has 2 r + 1 parts, which are alternately upright and inverted.
         upright = along % 2 == 0
         second = along // 2 + np.where(upright, 1 / 3, 2 / 3)
         total = row + np.where(upright, 2 / 3, 1 / 3)

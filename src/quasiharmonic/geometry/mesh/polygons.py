@@ -136,7 +136,7 @@ def triangulate_polygons(V: FloatArray, vertices: IntArray, starts: IntArray) ->
 def _check_rings(vertices: IntArray, sizes: IntArray) -> None:
     small = np.flatnonzero(sizes < 3)
     if small.size:
-        raise ValueError(f"{names_of('face', 'faces', small)} of fewer than three corners")
+        raise ValueError(f"{names_of('face', 'faces', small)} of fewer than three corners: remove them")
     face = repeat_each(np.arange(len(sizes)), np.where(sizes > 3, sizes, 0))
     vertices = vertices[repeat_each(sizes > 3, sizes)]
     order = np.lexsort((vertices, face))

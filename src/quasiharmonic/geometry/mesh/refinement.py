@@ -43,6 +43,19 @@ class Refined:
         edge; after several rounds, up to three corners of an old triangle. The last index is repeated to fill the row.
     weights : (s, k) float64
         Weights of the parents; 0 for repeated ones.
+
+    See Also
+    --------
+    refine : Makes it.
+    results.RefinedProblem : A problem on such a mesh.
+
+    Examples
+    --------
+    >>> from quasiharmonic import refine
+    >>> V = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
+    >>> refined = refine(V, [[0, 1, 2], [0, 2, 3]], [[0, 2]])
+    >>> refined.parents.tolist(), refined.V[4].tolist()
+    ([[0, 2]], [0.5, 0.5])
     """
 
     V: FloatArray

@@ -271,7 +271,9 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
                 "inspect_mesh (qhm check) lists defects, and vertices at equal positions that may need to be merged"
             )
         unpaired = np.setxor1d(tails, heads)
-        raise ValueError(f"the boundary does not close at {vertex_names(unpaired)}")
+        raise ValueError(
+            f"the boundary does not close at {vertex_names(unpaired)}; orient all triangles alike with clean"
+        )
     return np.split(vertices, np.cumsum(lengths[: number - 1])) if number > 1 else [vertices][:number]
 
 
@@ -368,7 +370,7 @@ def surface_edges(F: IntArray, n: int) -> Edges:
         first = np.unique(label)
         raise ValueError(
             f"the mesh has {first.size} components, the first ones around {vertex_names(first)}: "
-            "map each component separately"
+            "map each component separately; if vertices at equal positions belong together, weld them first with clean"
         )
     return found
 
@@ -399,8 +401,12 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
 def _check_triangles(F: IntArray) -> None:
     collapsed = np.flatnonzero(are_collapsed(F))
     if collapsed.size:
-        raise ValueError(f"{triangle_names(collapsed)}: a vertex is used twice in a triangle")
+        raise ValueError(
+            f"{triangle_names(collapsed)}: a vertex is used twice in a triangle; remove such triangles with clean"
+        )
 
     repeats = np.flatnonzero(find_twins(F) < np.arange(len(F)))
     if repeats.size:
-        raise ValueError(f"{triangle_names(repeats)} repeated: the same three vertices occur before")
+        raise ValueError(
+            f"{triangle_names(repeats)} repeated: the same three vertices occur before; remove repetitions with clean"
+        )

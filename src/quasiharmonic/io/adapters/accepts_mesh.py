@@ -56,7 +56,7 @@ def simulation_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
         read = read_volume(mesh)
         T, H = split_solids(read.F)
         if len(H):
-            raise ValueError(f"{what} has hexahedra: only tetrahedra are supported")
+            raise ValueError(f"{what} has hexahedra: split them into tetrahedra")
         if len(T):
             return read.points, T
         read = read_fem(mesh)

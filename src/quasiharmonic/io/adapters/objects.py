@@ -234,6 +234,20 @@ def as_seamed_mesh(mesh: MeshLike) -> SeamedMesh:
         If positions or faces are missing.
     quasiharmonic.io.MeshFileError
         If the file cannot be read.
+
+    See Also
+    --------
+    atlas.SeamedMesh : From arrays.
+    quasiharmonic.io.read_mesh : Reads a file with all its data.
+
+    Examples
+    --------
+    >>> from quasiharmonic.atlas import as_seamed_mesh
+    >>> from quasiharmonic.io import MeshData
+    >>> from quasiharmonic.surfaces import grid
+    >>> V, F = grid(2, 2)
+    >>> len(as_seamed_mesh(MeshData(V, F)).islands)
+    1
     """
     if isinstance(mesh, SeamedMesh):
         return mesh

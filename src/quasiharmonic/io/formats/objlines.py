@@ -16,7 +16,7 @@ from quasiharmonic.io.lowlevel.textual import integer, number, quote_token
 from quasiharmonic.io.models.meshdata import MeshData, OriginalLines, polygon_mesh
 from quasiharmonic.util.arrays import count_of
 
-# Statements that are refused: reading would lose their geometry.
+# Statements that are rejected: reading would lose their geometry.
 REFUSED = {b"curv", b"curv2", b"surf", b"bsp", b"bzp", b"cdc", b"cdp", b"fo", b"call"}
 _PLAIN_ELEMENT = re.compile(rb"[lp][ \t0-9]*")
 # Most numbers after the coordinates of a vertex: weight and colour with opacity.

@@ -63,6 +63,11 @@ def diagnose(V: Any, *arguments: Any, **options: Any) -> Diagnosis:
     ValueError
         If the input is malformed; see `Problem`.
 
+    See Also
+    --------
+    refine_problem : Splits the edges that prevent a map.
+    injective_map : Diagnoses the problem itself if it finds no map.
+
     Notes
     -----
     Let χ be the Euler characteristic of the surface. For any target, a map without inverted triangles requires
@@ -93,6 +98,16 @@ def diagnose(V: Any, *arguments: Any, **options: Any) -> Diagnosis:
        Bourbaki 342 (1968).
     .. [2] S. Suri, A linear time algorithm for minimum link paths inside a simple polygon. Computer
        Vision, Graphics, and Image Processing 35 (1986).
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, boundary_loops, diagnose
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> diagnosis = diagnose(Problem(V, F, rim, V[rim[::-1]]))
+    >>> [obstruction.kind.name for obstruction in diagnosis.obstructions]
+    ['REVERSED']
     """
     if isinstance(V, Problem) and (arguments or options):
         raise TypeError("diagnose(problem) accepts no further arguments")

@@ -20,7 +20,18 @@ if TYPE_CHECKING:
 
 
 class Forbids(Enum):
-    """The largest class of maps that an obstruction excludes; the value is a message."""
+    """The largest class of maps that an obstruction excludes; the value is a message.
+
+    See Also
+    --------
+    results.Obstruction : States what it forbids.
+
+    Examples
+    --------
+    >>> from quasiharmonic.results import Forbids
+    >>> [one.name for one in Forbids]
+    ['INJECTIVE', 'UNBRANCHED', 'BIJECTIVE']
+    """
 
     INJECTIVE = "no map without inverted triangles exists"
     UNBRANCHED = "a map without inverted triangles winds more than once around one of its vertices"
@@ -28,14 +39,32 @@ class Forbids(Enum):
 
 
 class Kind(Enum):
-    """The kind of an obstruction; the value is advice for the user."""
+    """The kind of an obstruction; the value is advice for the user.
+
+    See Also
+    --------
+    results.Obstruction : Has a kind.
+
+    Examples
+    --------
+    >>> from quasiharmonic import boundary_loops, diagnose
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> (obstruction,) = diagnose(V, F, rim, V[rim[::-1]]).obstructions
+    >>> obstruction.kind.name
+    'REVERSED'
+    """
 
     COLLAPSED_EDGE = "Give the two vertices different positions."
     INVERTED_TRIANGLE = "Split the triangle's interior edges, or move one of its vertices."
     INVERTED_PATCH = "Split the fixed edges around the patch, or move their vertices."
     SIGNED_AREA = "Reflect the target or reverse its loops until it winds counterclockwise around the mesh."
     HALF_PLANES = "Split the edges between the vertex and the edges it should lie to the left of."
-    REVERSED = "Reverse the winding of the triangles, F[:, ::-1], or reflect the target."
+    REVERSED = (
+        "Check that fixed and target are in the same order, and try target[::-1]. Otherwise reverse the winding of the "
+        "triangles, F[:, ::-1], or reflect the target."
+    )
     TURNING_NUMBER = "Untwist the target: reverse or move the loops until their turning numbers add up."
     NEGATIVE_WINDING = "Untwist the target, or move the loops so that holes lie inside and run clockwise."
     GENUS = "Cut the handles of the surface open."
@@ -79,6 +108,21 @@ class Obstruction(ReadOnly):
         Boundary loops, as indices into ``Domain.loops``.
     split : (s, 2) int64
         Interior edges whose split would remove the obstruction. Empty if no refinement of the mesh helps.
+
+    See Also
+    --------
+    Diagnosis : Lists them as ``obstructions``.
+    results.Kind : The violated condition.
+
+    Examples
+    --------
+    >>> from quasiharmonic import boundary_loops, diagnose
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> (obstruction,) = diagnose(V, F, rim, V[rim[::-1]]).obstructions
+    >>> obstruction.forbids.name, obstruction.split.tolist()
+    ('INJECTIVE', [])
     """
 
     kind: Kind
@@ -127,6 +171,20 @@ class Diagnosis(Displayable):
         Conditions that do not apply to this problem or were not decided, and why.
     problem : Problem or None
         The examined problem, if there is one.
+
+    See Also
+    --------
+    diagnose : Makes it.
+    results.Obstruction : One reason why there is no map.
+
+    Examples
+    --------
+    >>> from quasiharmonic import boundary_loops, diagnose
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> diagnose(V, F, rim, V[rim]).obstructions
+    ()
     """
 
     obstructions: tuple[Obstruction, ...]

@@ -93,6 +93,18 @@ class Descent(SearchStage):
     ------
     ValueError
         If a setting is invalid.
+
+    See Also
+    --------
+    injective_map : Takes a sequence of descents as its strategy.
+    quasiharmonic.solver.methods : The descents.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Descent
+    >>> from quasiharmonic.solver.methods import Newton
+    >>> isinstance(Newton(resume=True), Descent)
+    True
     """
 
     resume: bool = False

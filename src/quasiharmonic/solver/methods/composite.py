@@ -40,7 +40,8 @@ class Composite(VectorAdam):
     Attributes
     ----------
     direct : int
-        Number of steps before the composite. Easy maps need no more, and the composite costs as much as 5 to 15 steps.
+        Number of steps before the composite. They suffice for many maps. The composite costs as much as 5 to 15
+        steps.
     """
 
     direct: int = 6

@@ -3,8 +3,8 @@
     as given, shortly ──▶ constructed, if no vertex has to be added
                       ──▶ as given ──▶ named edges ──▶ around inverted triangles ──▶ constructed
 
-An attempt is made only if those before it found no map. The construction takes little time, while a failing search
-takes much. The construction is therefore made as soon as the first stages of the search fail, if the target is simple.
+An attempt is made only if those before it found no map. The construction takes little time, and a failing search
+takes long. The construction is therefore made as soon as the first stages of the search fail, if the target is simple.
 The number of vertices that it adds determines whether the attempts in between are worth their time. If they are, they
 get a reduced budget. The construction is used if they fail or add more vertices.
 

@@ -28,6 +28,19 @@ class RefinedProblem(BaseOutcome):
         Obstructions to a map; refinement does not remove these.
     rounds : int
         Number of rounds of edge splitting.
+
+    See Also
+    --------
+    refine_problem : Makes it.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, boundary_loops, refine_problem
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> refine_problem(Problem(V, F, rim, V[rim])).diagnosis.obstructions
+    ()
     """
 
     problem: Problem
@@ -79,7 +92,8 @@ def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = Fal
 
     See Also
     --------
-    refine_problem : splits the edges that a diagnosis names.
+    refine_problem : Splits the edges that a diagnosis names.
+    diagnose : Names edges that prevent a map.
 
     Examples
     --------
@@ -108,8 +122,19 @@ def refine_problem(problem: Problem, *, max_rounds: int = 20) -> RefinedProblem:
 
     See Also
     --------
-    refine : splits edges that the caller names.
-    quasiharmonic.diagnose : names them.
+    refine : Splits edges that the caller names.
+    diagnose : Names the edges.
+    injective_map : Splits edges itself with ``refine=True``.
+
+    Examples
+    --------
+    >>> from quasiharmonic import Problem, boundary_loops, refine_problem
+    >>> from quasiharmonic.surfaces import disk
+    >>> V, F = disk(4)
+    >>> (rim,) = boundary_loops(F)
+    >>> refined = refine_problem(Problem(V, F, rim, V[rim]))
+    >>> refined.success, refined.rounds
+    (True, 0)
     """
     check_problem("refine_problem", problem)
     check_integer("max_rounds", max_rounds, minimum=0)

@@ -37,6 +37,7 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.options import HarmoniseOptions, takes
 from quasiharmonic.util.progress import reports_progress
+from quasiharmonic.util.spelling import suggest
 
 
 def _without_mesh(energy: Energy) -> Callable[[FloatArray, IntArray], Energy]:
@@ -144,6 +145,12 @@ def harmonise(
         is a barrier and ``uv`` is not injective. If a user-defined energy or its first derivative is NaN or infinite
         at the start of a round. The message names the triangles.
 
+    See Also
+    --------
+    polish : Faster for barriers with second derivatives.
+    distortion : Measures the distortion.
+    quasiharmonic.atlas.harmonise : Every island of a mesh with seams.
+
     Examples
     --------
     Equalise the areas of a disk whose triangles are crowded at the centre:
@@ -185,14 +192,17 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
     if barrier and inverted.size:
         raise ValueError(
             f"uv is not injective: {names_of('triangle', 'triangles', inverted)} inverted or degenerate, where "
-            "this energy is infinite; start from an injective map, or lower R₁ (energy=None)"
+            "this energy is infinite; repair the map first (repair; qhm repair), or use an energy without a barrier"
         )
     name = options.energy if isinstance(options.energy, str) else "R₁" if chosen is None else type(chosen).__name__
     problem = Problem.on(domain, start[domain.fixed])
     with problem.exclusive() as own, np.errstate(all="ignore"):
         area = float(signed_areas(own.F, own.frame.inward(start)).sum())
         if not area > 0:
-            raise ValueError("the boundary encloses no area in uv, or has the wrong orientation")
+            raise ValueError(
+                "the boundary encloses no area in uv, or has the wrong orientation: reflect uv, or map the boundary "
+                "again"
+            )
         deformation = None
         if chosen is not None:
             # The map is in the frame's unit. Scale the surface accordingly so that both compare as in the caller's
@@ -237,7 +247,10 @@ def _find_energy(energy: str | Energy | None, domain: Domain) -> Energy | None:
     if energy is None or isinstance(energy, Energy):
         return energy
     if not isinstance(energy, str) or energy not in ENERGIES:
-        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {describe(energy)}")
+        near = suggest(energy, ENERGIES)
+        raise ValueError(
+            f"energy must be one of {', '.join(ENERGIES)}, an Energy or None, not {describe(energy)}{near}"
+        )
     return ENERGIES[energy](domain.V, domain.F)
 
 

@@ -94,6 +94,12 @@ def injective_maps(
     ImportError
         If the named linear solver is not installed.
 
+    See Also
+    --------
+    injective_map : One problem, with all options.
+    animate : A sequence of targets whose maps stay close to each other.
+    quasiharmonic.batch : Files of problems.
+
     Notes
     -----
     Meshes of up to 4,000 triangles are combined into groups of about 28,000 triangles for the first stage of the

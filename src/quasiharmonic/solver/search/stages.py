@@ -27,6 +27,7 @@ from quasiharmonic.solver.methods import (
 )
 from quasiharmonic.solver.methods.base import SearchStage, StageRunner
 from quasiharmonic.util.arrays import describe
+from quasiharmonic.util.spelling import suggest
 
 #: Stages of a strategy.
 Stages: TypeAlias = Sequence[SearchStage]
@@ -194,7 +195,10 @@ def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
     """Return the stages of a named strategy, or the given list of stages; raise a ValueError if neither is valid."""
     if isinstance(strategy, str):
         if strategy not in STRATEGIES:
-            raise ValueError(f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}")
+            near = suggest(strategy, STRATEGIES)
+            raise ValueError(
+                f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}{near}"
+            )
         return STRATEGIES[strategy](problem)
     given = list(strategy) if isinstance(strategy, Sequence) else []
     stages = [stage for stage in given if isinstance(stage, SearchStage)]

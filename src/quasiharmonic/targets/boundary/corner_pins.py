@@ -110,7 +110,10 @@ class Pins:
                 "say which corner each vertex goes to"
             )
         if len(set(self.contour_of.values())) < len(self.contour_of):
-            raise ValueError("two boundary loops have vertices that go to the same contour of the outline")
+            raise ValueError(
+                "two boundary loops have vertices that go to the same contour of the outline: give each loop its own "
+                "contour"
+            )
 
     def _check_vertices(self, chosen: list[Any], n: int) -> None:
         vertices = index_array("corners", chosen)
@@ -151,7 +154,8 @@ class Pins:
         for one, other in itertools.pairwise(found):
             if one[0] == other[0]:
                 raise ValueError(
-                    f"vertices {names[one[1]]} and {names[other[1]]} have the same target position on the outline"
+                    f"vertices {names[one[1]]} and {names[other[1]]} have the same target position on the outline: "
+                    f"move one of them"
                 )
         if positions.size and (np.diff((positions - positions[0]) % len(names)) < 0).any():
             there = positions[np.argsort((positions - positions[0]) % len(names))]
@@ -348,7 +352,7 @@ def nearest_on_boundary(V: ArrayLike, F: ArrayLike, places: ArrayLike) -> IntArr
     points, wanted = vertex_array(V), vertex_array(places, "places")
     loops = boundary_loops(triangle_array(F, len(points)), len(points))
     if not loops:
-        raise ValueError("the surface is closed: it has no boundary vertices")
+        raise ValueError("the surface is closed: it has no boundary vertices; cut it open first (cut_open; --cut)")
     border = np.sort(np.concatenate(loops))
     both = scale_to_unit(np.concatenate([pad_to_space(points[border]), pad_to_space(wanted)]))
     here, there = both[: len(border)], both[len(border) :]

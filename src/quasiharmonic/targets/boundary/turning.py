@@ -179,7 +179,7 @@ def boundary_corners(V: ArrayLike, F: ArrayLike, count: int) -> IntArray:
     """
     loops = boundary_turning(V, F)
     if not loops:
-        raise ValueError("the surface is closed: it has no boundary with corners")
+        raise ValueError("the surface is closed: it has no boundary with corners; cut it open first (cut_open; --cut)")
     loop = loops[find_outermost([one.vertices for one in loops], in_space(vertex_array(V)))]
     return loop.vertices[loop.corners(count)[0]]
 

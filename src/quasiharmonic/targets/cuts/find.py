@@ -97,6 +97,12 @@ def find_cuts(
         cost is not positive. When the triangles are not a surface: an edge has three triangles, the winding is
         inconsistent, or a triangle repeats a vertex. The message lists the first elements.
 
+    See Also
+    --------
+    cut_open : Cuts the surface along the edges.
+    crease_costs : Costs that keep cuts in creases.
+    unwrap : Cuts, flattens and packs.
+
     Examples
     --------
     A starfish is cut to the end of each of its three arms; the cuts between the arms are nearly the shortest:
@@ -183,6 +189,10 @@ def crease_costs(V: ArrayLike, F: ArrayLike) -> FloatArray:
     ------
     ValueError
         As `find_cuts`.
+
+    See Also
+    --------
+    find_cuts : Takes the costs.
 
     Examples
     --------

@@ -212,7 +212,7 @@ def arrange(contours: Sequence[ArrayLike]) -> list[NestedContour]:
         return []
     for i, contour in enumerate(found):
         if is_collinear(contour):
-            raise ValueError(f"contour {i} of the outline encloses no area")
+            raise ValueError(f"contour {i} of the outline encloses no area: remove it")
     points = np.concatenate(found)
     curves = LoopEdges.of(np.split(np.arange(len(points)), np.cumsum([len(c) for c in found])[:-1]), points)
     _check_simple(curves, points)

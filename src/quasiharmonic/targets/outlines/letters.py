@@ -77,7 +77,7 @@ def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4)
     except ValueError as error:
         raise ValueError(f"the glyph of {character!r}: {error}") from error
     if not contours:
-        raise ValueError(f"the glyph of {character!r} has no outline")
+        raise ValueError(f"the glyph of {character!r} has no outline: choose another character")
     return contours
 
 
@@ -137,7 +137,7 @@ def _read_glyph(character: str, file: FilePath) -> list[Pieces]:
     except Exception as error:  # a damaged font may raise any error
         raise ValueError(f"{file} is not a readable font: {error}") from error
     if name is None:
-        raise ValueError(f"{file.name} has no glyph for {character!r}")
+        raise ValueError(f"{file.name} has no glyph for {character!r}: choose another font")
     return [[piece / em for piece in path] for path in pen.paths if path]
 
 

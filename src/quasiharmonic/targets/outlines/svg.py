@@ -83,7 +83,7 @@ def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[F
     subpaths = svg_paths(path)
     controls = [control for pieces in subpaths for control in pieces]
     if not controls:
-        raise MeshFileError(path, "has no path or shape")
+        raise MeshFileError(path, "has no path or shape", remedy="convert texts to paths")
     every = np.concatenate(controls)
     if not np.abs(every).max() < _LARGEST:
         raise MeshFileError(path, "has coordinates that are too large")

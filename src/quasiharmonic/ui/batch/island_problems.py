@@ -30,7 +30,7 @@ class BatchIsland(NamedTuple):
 
 
 def make_surface(mesh: io.MeshData, settings: dict[str, Any]) -> SeamedMesh:
-    """Return the surface of a file with the seams of its map, and with additional cuts if the settings ask for them."""
+    """Return the surface of a file with the seams of its map, and with additional cuts if the settings contain them."""
     surface = io.seamed(mesh)
     if settings["cut"]:
         flat = settings["flatten"]

@@ -41,7 +41,7 @@ GROUPS = {
         "repair": "untangle the inverted triangles of a UV map, with a fixed boundary",
         "refine": "split the edges that prevent a map",
         "animate": "map a surface to a sequence of targets, each frame certified, without jumps",
-        "morph": "move the boundary of a planar mesh (Gmsh, VTK) and keep its interior valid",
+        "morph": "move the boundary of a planar or tetrahedral mesh, and keep all elements valid",
         "transfer": "transfer positions, values and landmarks between two mapped surfaces",
         "field": "make a displacement field of an image invertible",
     },

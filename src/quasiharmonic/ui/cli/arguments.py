@@ -182,14 +182,14 @@ SHARED: dict[str, Option] = {
     "font": text("FONT", "for letters and words: a font file or the name of a font"),
     "corners": text(
         "V,V,…",
-        "boundary vertices, 0-based, that go to the outline's corners in the order it has them in (qhm check "
-        "--boundary numbers them), near:x,y,z for the one nearest to a place; or V:K for its corner K (from 0), V:X:Y "
-        "for its point (X, Y); or a file of these, one a line; or auto, by angle",
+        "boundary vertices for the outline's corners, in the order of the corners: 0-based numbers, which qhm check "
+        "--boundary lists, or near:x,y,z for the vertex nearest to a point; V:K is for corner K (from 0), V:X:Y for "
+        "the outline's point (X, Y); or a file with one of these on each line; or auto, by angle",
     ),
     "corner_angle": number(
         degrees,
-        "how far an outline turns at a corner; with 0 all its points are corners, and its sides are matched edge "
-        "by edge (default: %(default)g)",
+        "minimum turn of the outline at a corner, in degrees; with 0 all its points are corners, and its sides are "
+        "matched edge by edge (default: %(default)g)",
         metavar="DEG",
         default=20.0,
     ),
@@ -201,8 +201,8 @@ SHARED: dict[str, Option] = {
     "cut": flag("cut surfaces that cannot be flattened, along seams; vertices and faces of the model are unchanged"),
     "seams": text(
         "WHICH",
-        "where seams are: file, where the input's vt have them (default); none; or a file of edges, two vertices, "
-        "0-based, on each line",
+        "seams to use: file, those of the input's vt (default); none; or a file of edges, two vertices, 0-based, on "
+        "each line",
         default="file",
     ),
     "islands": number(
@@ -218,10 +218,12 @@ SHARED: dict[str, Option] = {
         float, f"for --pack: minimum distance between islands in texels (default: {PADDING})", metavar="TEXELS"
     ),
     "texture": text(
-        "IMAGE", "add a texture, a PNG or JPEG file or checkerboard: beside an OBJ as .mtl and image, within a GLB"
+        "IMAGE", "texture to add: a PNG or JPEG file, or checkerboard; beside an OBJ as .mtl and image, within a GLB"
     ),
-    "reference": choice(options.REFERENCES, "reference triangles"),
-    "rings": number(count, "for distances: largest number of edges between two vertices (default: 20)"),
+    "reference": choice(
+        options.REFERENCES, "shape of the triangles in which gradients are taken (default: that of the strategy)"
+    ),
+    "rings": number(count, "for --energy distances: largest number of edges between two vertices (default: 20)"),
     "surface": file(
         "the surface with the triangles of a FreeSurfer patch (default: beside the patch, such as "
         "lh.inflated for lh.cortex.patch.3d)",

@@ -202,8 +202,8 @@ MOTIONS: dict[str, Option] = {
     "centre": in_order(
         vector,
         "X,Y[,Z]",
-        "point about which the last --group is rotated and scaled (default: the mean of its nodes, where they are by "
-        "then)",
+        "point about which the last --group is rotated and scaled (default: the mean of its nodes after its earlier "
+        "motions)",
     ),
 }
 

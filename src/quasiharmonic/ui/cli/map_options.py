@@ -97,10 +97,9 @@ def surface(
     islands = len(found.mesh.islands)
     if islands > 1:
         found.facts["island_count"] = islands
-        found.notes.append(
-            f"{islands} islands, each mapped on its own"
-            + (" (use --seams none to map the surface as one island)" if options.seams != "none" else "")
-        )
+        joined = options.seams != "none" and len(SeamedMesh(mesh.V, mesh.F).islands) < islands
+        advice = "use --seams none to map the surface without seams" if joined else "qhm check lists vertices to weld"
+        found.notes.append(f"{islands} islands, each mapped on its own ({advice})")
     return found
 
 
@@ -117,7 +116,9 @@ def read_edges(path: Path, n: int) -> NDArray[np.int64]:
     rows = []
     for number, ends in read_pairs(path, "an edge"):
         if max(ends) >= n:
-            raise MeshFileError(path, f"vertex {max(ends)} of a mesh with {n}", number, "indices count from 0")
+            raise MeshFileError(
+                path, f"vertex {max(ends)} does not exist in a mesh of {n} vertices", number, "indices count from 0"
+            )
         rows.append(ends)
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
@@ -136,7 +137,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "targets of the boundary", "By default the targets are the texture coordinates (vt) of the input."
     )
-    arguments.add_options(group.add_mutually_exclusive_group(), "fixed", to=arguments.text("OUTLINE", FORMS))
+    arguments.add_options(
+        group.add_mutually_exclusive_group(),
+        "fixed",
+        to=arguments.text("OUTLINE", f"outline for the boundary: {FORMS}"),
+    )
     arguments.add_options(group, "font", "corners", "corner_angle", "cut", "seams")
 
 

@@ -161,7 +161,11 @@ def name_source(source: Path | str) -> Iterator[None]:
         yield
     except ValueError as error:
         text = str(error)
-        if isinstance(error, MeshFileError) or text.startswith(f"{source}:") or text.endswith(_COUNTING):
+        if (
+            isinstance(error, MeshFileError)
+            or text.startswith((f"{source}:", f"{source} --to "))
+            or text.endswith(_COUNTING)
+        ):
             # The error names its file, or an inner block has named it.
             raise
         numbered = _NUMBERED.search(text) and not _NEEDS_NO_NOTE.search(text)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shutil
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO
 from itertools import chain, pairwise
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -229,7 +229,7 @@ def _mp4(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
     return encode_by("animation.mp4", write)
 
 
-def plot_convergence(result: MapResult) -> Figure:
+def plot_convergence(result: MapResult | Sequence[MapResult] | Mapping[str, MapResult]) -> Figure:
     """Draw the energy of a result's history above its number of inverted triangles, over iterations.
 
     Each run has its own line because runs lower different objectives. A search lowers an energy in excess of the
@@ -237,7 +237,8 @@ def plot_convergence(result: MapResult) -> Figure:
 
     Parameters
     ----------
-    result : MapResult
+    result : MapResult, sequence of MapResult, or mapping from str to MapResult
+        Several results have one colour each, and their names or numbers are in the legend.
 
     Returns
     -------
@@ -246,32 +247,47 @@ def plot_convergence(result: MapResult) -> Figure:
     Raises
     ------
     ValueError
-        If the result has no history.
+        If a result has no history, or there are no results.
     """
     from matplotlib.ticker import MaxNLocator
 
-    check_instance("result", result, MapResult)
-    if not result.history:
-        raise ValueError("the result has no history to draw")
+    several = not isinstance(result, MapResult)
+    results: dict[Any, MapResult]
+    if isinstance(result, Mapping):
+        results = dict(result)
+    else:
+        results = dict(enumerate(result if isinstance(result, Sequence) else [result]))
+    if not results:
+        raise ValueError("there are no results to draw")
+    for one in results.values():
+        check_instance("result", one, MapResult)
+        if not one.history:
+            raise ValueError("the result has no history to draw")
     figure = new_figure((8, 4.5))
     energy, flips = figure.add_axes((0.09, 0.45, 0.88, 0.5)), figure.add_axes((0.09, 0.12, 0.88, 0.26))
-    begin = 0
-    for number, (name, steps) in enumerate(_runs(result)):
-        at = begin + np.arange(len(steps))
-        values = np.array([step.energy for step in steps])
-        values[~(np.isfinite(values) & (values > 0))] = np.nan
-        color = _COLORS[number % len(_COLORS)]
-        energy.plot(at, values, ".-", color=color, markersize=4, linewidth=1.4, label=name)
-        flips.plot(at, [step.inverted for step in steps], ".-", color=RED, markersize=4, linewidth=1.2)
-        # The next run starts from the last map of this run.
-        begin += len(steps) - 1
+    last = 1
+    for place, (label, one) in enumerate(results.items()):
+        begin = 0
+        for number, (name, steps) in enumerate(_runs(one)):
+            at = begin + np.arange(len(steps))
+            values = np.array([step.energy for step in steps])
+            values[~(np.isfinite(values) & (values > 0))] = np.nan
+            color = _COLORS[(place if several else number) % len(_COLORS)]
+            # The legend lists the runs of one result, or several results.
+            shown = name if not several else "" if number else str(label)
+            energy.plot(at, values, ".-", color=color, markersize=4, linewidth=1.4, label=shown)
+            many = [step.inverted for step in steps]
+            flips.plot(at, many, ".-", color=color if several else RED, markersize=4, linewidth=1.2)
+            # The next run starts from the last map of this run.
+            begin += len(steps) - 1
+        last = max(last, begin)
     if np.isfinite(np.concatenate([line.get_ydata() for line in energy.lines])).any():
         energy.set_yscale("log")
     flips.set_yscale("symlog", linthresh=1)
-    flips.set_ylim(0, 2 * max(1, max(step.inverted for step in result.history)))
+    flips.set_ylim(0, 2 * max(1, max(step.inverted for one in results.values() for step in one.history)))
     for ax, x, y in ((energy, "", "energy"), (flips, "iterations", "inverted")):
         name_axes(ax, x, y)
-        ax.set_xlim(0, max(1, begin))
+        ax.set_xlim(0, last)
     energy.tick_params(labelbottom=False)
     flips.xaxis.set_major_locator(MaxNLocator(integer=True))
     energy.legend(frameon=False, fontsize=9)

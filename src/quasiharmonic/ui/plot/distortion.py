@@ -109,7 +109,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     uv = map_array("uv", uv, len(rest))
     found = distortion(rest, F, uv)
     values: FloatArray = found.per_triangle()[measure]
-    scale = _scale(measure, values, found.share)
+    scale = choose_scale(measure, values, found.share)
     color = scale.colors(values)
 
     figure = new_figure((13.5, 4.5))
@@ -122,7 +122,7 @@ def plot_distortion(V: ArrayLike, F: ArrayLike, uv: ArrayLike, measure: str = "i
     paint_map(plane, F, uv, color, found.inverted)
     many = len(found.inverted)
     caption(plane, f"map: {many:,} inverted" if many else "map", RED if many else INK)
-    _bar(figure, scale)
+    draw_bar(figure, scale)
     _histogram(bars, found, measure, values, scale)
     return figure
 
@@ -150,10 +150,11 @@ def save_distortion_figure(
     save_picture(path, plot_distortion(V, F, uv, measure))
 
 
+_BAR = (0.605, 0.14, 0.012, 0.74)
 _LAYOUT = ((0.005, 0.02, 0.29, 0.88), (0.30, 0.02, 0.29, 0.88), (0.72, 0.14, 0.265, 0.74))
 
 
-def _scale(measure: str, values: FloatArray, share: FloatArray) -> _ColourScale:
+def choose_scale(measure: str, values: FloatArray, share: FloatArray) -> _ColourScale:
     """Choose the colour scale of a measure for the given values; raise ValueError if no value is usable."""
     from matplotlib.colors import AsinhNorm, LogNorm, Normalize
 
@@ -184,12 +185,12 @@ def _share_between(values: FloatArray, share: FloatArray, low: float, high: floa
     return float(first), float(last)
 
 
-def _bar(figure: Figure, scale: _ColourScale) -> None:
-    """Draw the colour bar between the map and the histogram."""
+def draw_bar(figure: Figure, scale: _ColourScale, box: tuple[float, float, float, float] = _BAR) -> None:
+    """Draw the colour bar of a scale into a box of the figure: left, bottom, width and height."""
     from matplotlib.cm import ScalarMappable
 
     drawn = ScalarMappable(scale.norm, scale.colormap)
-    bar = figure.colorbar(drawn, cax=figure.add_axes((0.605, 0.14, 0.012, 0.74)), extend=scale.beyond)
+    bar = figure.colorbar(drawn, cax=figure.add_axes(box), extend=scale.beyond)
     # Use the histogram's ticks, because a logarithmic bar over less than a decade has at most one tick.
     bar.ax.set_yticks(*scale.ticks, size=9)
     bar.ax.minorticks_off()

@@ -87,16 +87,16 @@ def plot_texture(
     color: Callable[[FloatArray], FloatArray]
     if texture is None:
         low, size = uv.min(axis=0), float(np.ptp(uv, axis=0).max()) or 1.0
-        board, color = (uv - low) / size * squares, _checkerboard_color
+        board, color = (uv - low) / size * squares, checkerboard_color
     else:
         board, color = uv, _make_image_color(texture)
     inverted = find_not_positive(F, uv)
     seen = view(rest, F)
     figure = new_figure((9.6, 4.8))
     surface, plane = panels(figure, 2)
-    _show(surface, seen.points, _render(seen.points, seen.depth, F, board, color, inverted, seen.light))
+    show_render(surface, seen.points, render(seen.points, seen.depth, F, board, color, inverted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
-    _show(plane, board, _render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
+    show_render(plane, board, render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
     draw_edges(plane, board, boundary_edges(F, len(board)))
     verdict(plane, "map", len(inverted))
     return figure
@@ -131,7 +131,7 @@ def save_texture_figure(
     save_picture(path, plot_texture(V, F, uv, squares=squares, texture=texture))
 
 
-def _show(ax: Axes, points: FloatArray, image: FloatArray) -> None:
+def show_render(ax: Axes, points: FloatArray, image: FloatArray) -> None:
     """Show a rendered image in axes, in the coordinates of its points."""
     low, high = _window(points)
     ax.imshow(image, interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
@@ -145,7 +145,7 @@ def _window(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     return (low + high) / 2 - reach, (low + high) / 2 + reach
 
 
-def _render(
+def render(
     points: FloatArray,
     depth: FloatArray,
     F: IntArray,
@@ -186,7 +186,7 @@ def _render(
     return np.concatenate([shown, cover[..., None] / _SAMPLES**2], axis=2)
 
 
-def _checkerboard_color(coordinates: FloatArray) -> FloatArray:
+def checkerboard_color(coordinates: FloatArray) -> FloatArray:
     """Return the colours (k, 3) of a checkerboard whose squares have side 1."""
     column, row = np.floor(coordinates).T
     half = (column + row) / 2

@@ -32,7 +32,7 @@ class ProtocolError(ValueError):
 
 
 class MessageFrame(NamedTuple):
-    """Message."""
+    """A message: its header and its arrays."""
 
     # Plain JSON; ``kind`` is the type of a message to the page, ``do`` the command of a message from the page
     header: dict[str, Any]

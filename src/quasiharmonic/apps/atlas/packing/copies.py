@@ -25,7 +25,7 @@ class Motion(NamedTuple):
     shift: complex
 
     def move(self, z: ComplexArray) -> ComplexArray:
-        """Move points."""
+        """Apply the motion to points (k,)."""
         return np.asarray((-z.conj() if self.mirrored else z) * self.turn + self.shift)
 
 

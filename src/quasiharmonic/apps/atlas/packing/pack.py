@@ -52,6 +52,18 @@ class Placement:
         Position of the chart's origin in its tile, in texels from the lower left corner.
     tile : int
         Number of the tile. The UDIM number is 1001 + tile.
+
+    See Also
+    --------
+    atlas.Packing : Lists them as ``placements``.
+
+    Examples
+    --------
+    >>> from quasiharmonic.atlas import pack_charts
+    >>> from quasiharmonic.surfaces import grid
+    >>> (placement,) = pack_charts([grid(2, 2)], resolution=100, padding=2, rotate=False).placements
+    >>> abs(placement.angle), placement.mirrored, placement.tile
+    (0.0, False, 0)
     """
 
     angle: float
@@ -74,6 +86,18 @@ class Packing:
         Scale of all charts: texels per unit of length of the given maps.
     utilisation : float
         Area of the charts in texels, as a fraction of all tiles. Charts in the same place count once.
+
+    See Also
+    --------
+    atlas.pack_charts : Makes it.
+
+    Examples
+    --------
+    >>> from quasiharmonic.atlas import pack_charts
+    >>> from quasiharmonic.surfaces import grid
+    >>> packing = pack_charts([grid(2, 2)], resolution=100, padding=2)
+    >>> packing.uv[0].shape, round(packing.texels_per_unit)
+    ((9, 2), 98)
     """
 
     placements: tuple[Placement, ...]
@@ -132,6 +156,19 @@ def pack_charts(
     ------
     ValueError
         If arguments are malformed, or the charts do not fit. The message then names a sufficient resolution.
+
+    See Also
+    --------
+    atlas.pack : Packs the islands of a mesh.
+    quasiharmonic.unwrap : Makes charts and packs them.
+
+    Examples
+    --------
+    >>> from quasiharmonic.atlas import pack_charts
+    >>> from quasiharmonic.surfaces import disk
+    >>> packing = pack_charts([disk(4), disk(4)], resolution=256)
+    >>> len(packing.placements), bool(packing.utilisation > 0.3)
+    (2, True)
     """
     pairs = _check_charts(charts)
     size = check_texture(resolution, padding, texels_per_unit, tiles, rotate, stack)

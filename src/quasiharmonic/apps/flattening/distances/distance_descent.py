@@ -230,6 +230,11 @@ def keep_distances(V: ArrayLike, F: ArrayLike, uv: ArrayLike, **options: Unpack[
         If the input is malformed (see `Problem`), the surface has handles, a rest triangle has no area, or ``uv`` is
         not bijective; the message names the elements.
 
+    See Also
+    --------
+    flatten : Makes the map, and with ``energy="distances"`` does both.
+    energies.distances.surface_distances : Samples distances.
+
     Examples
     --------
     A dome seen from above is compressed at its boundary; the descent spreads it out:
@@ -253,7 +258,9 @@ def keep_distances(V: ArrayLike, F: ArrayLike, uv: ArrayLike, **options: Unpack[
     positions = map_array("uv", uv, n)
     certificate = certify(piece.F, positions, loops=piece.loops)
     if not certificate.bijective:
-        raise ValueError(f"uv is not bijective: the descent needs a bijective map. {certificate.summary()}")
+        raise ValueError(
+            f"uv is not bijective: the descent needs a bijective map. {certificate.summary()} Make one with flatten."
+        )
     result = MapResult(uv=positions, status=Status.INTERRUPTED, certificate=certificate)
     with Run().until_interrupted():
         lowered = lower_distance_error(piece, positions, checked)

@@ -26,7 +26,7 @@ _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126:
 _CODES = {np.dtype(kind): code for code, kind in _KINDS.items()}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _SHAPES = {width: shape for shape, width in _WIDTHS.items()}
-# Compression extensions, which need external libraries and are refused.
+# Compression extensions, which need external libraries and are rejected.
 _COMPRESSIONS = "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"
 _LISTS = (
     *("accessors", "bufferViews", "buffers", "images", "materials", "textures"),

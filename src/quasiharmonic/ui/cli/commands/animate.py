@@ -140,6 +140,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _files(given: list[Path]) -> list[Path]:
     """Return the given files, or the meshes of the given folder."""
+    from quasiharmonic import io
     from quasiharmonic.io.registry import suffixes
 
     if len(given) == 1 and given[0].is_dir():
@@ -149,6 +150,8 @@ def _files(given: list[Path]) -> list[Path]:
         if not found:
             raise ValueError(f"{given[0]}: no mesh in this folder ({', '.join(accepted)})")
         return found
+    if len(given) == 1 and not given[0].suffix and not given[0].exists():
+        raise io.MeshFileError(given[0], "there is no such file or folder")
     if len(given) > 1 and any(path.suffix.lower() == ".npy" for path in given):
         raise ValueError("an .npy array has all frames: give no other file with it")
     return given
@@ -182,7 +185,9 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
             mapped = io.mapped(frame)
         opened = mapped.opened()
         if opened.uv is None or not mapped.seamless:
-            raise ValueError(f"{path}: its map has seams, which frames do not support")
+            raise ValueError(
+                f"{path}: its map has seams, which frames do not support: map it without (qhm map --seams none)"
+            )
         positions.append(opened.uv[fixed])
     return np.stack(positions)
 

@@ -37,7 +37,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
 
     add_files(
         parser,
-        f"{format_names('read')} file with the look",
+        f"{format_names('read')} file: the old model, with its materials and colours",
         f"{format_names('write_map', 'image')} file to write",
         metavar=("OLD", "OUTPUT"),
     )

@@ -121,7 +121,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         start=flag("for --flatten: start from the map in the files' texture coordinates"),
         pack=flag("with --to and --flatten: pack the islands into the unit square by their shapes"),
         energy=choice(FLATTENED, "energy that --flatten lowers (default: symmetric-dirichlet)"),
-        polish=choice(ENERGIES, "then lower distortion: %(choices)s", metavar="ENERGY"),
+        polish=choice(ENERGIES, "lower the distortion of each injective map: %(choices)s", metavar="ENERGY"),
         slide=flag(
             "let boundary vertices slide along the outline while --polish lowers distortion; corners stay fixed"
         ),

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from quasiharmonic.targets import BoundaryLoop
     from quasiharmonic.ui.cli.pipeline import WrittenMap
 
+# Texels along a side of the texture, and the largest distance between islands that is measured, in texels.
+_RESOLUTION, _FAR = 2048, 8
 # Maximum number of corners per loop.
 _MAX_CORNERS = 12
 # Minimum turning angle of a corner in degrees, as for outlines.
@@ -125,7 +127,7 @@ def _verify(
     further = len(certified.V) - len(mesh.V)
     good = certified.injective
     facts = {**certified.to_dict(), "precision": precision, "triangles": len(mesh.F), "further_places": further}
-    lines = [certified.summary()]
+    lines = [certified.summary(), *_describe_gaps(certified)]
     if further:
         lines.append(f"The map has seams: vertices from {len(mesh.V)} on are copies of vertices on the seams.")
     if options.any_triangulation:
@@ -137,6 +139,19 @@ def _verify(
     diagnosis = None if good or len(found.welded) else _diagnose(mesh, fixed)
     facts["diagnosis"] = None if diagnosis is None else diagnosis.to_dict()
     return good, facts, lines if diagnosis is None else [*lines, diagnosis.summary()]
+
+
+def _describe_gaps(certified: WrittenMap) -> list[str]:
+    """Return a sentence on the smallest distance between islands in the unit square that do not overlap."""
+    from quasiharmonic.apps.unwrapping.chart_verdict import measure_clearance
+    from quasiharmonic.geometry.mesh.topology import components
+
+    uv = certified.uv
+    if certified.verdict is None or not certified.apart or uv.min() < 0 or uv.max() > 1:
+        return []
+    gap = measure_clearance(certified.certificate.loops, uv * _RESOLUTION, components(certified.F, len(uv)), reach=_FAR)
+    apart = f"at least {gap:.3g}" if gap < float("inf") else f"more than {_FAR}"
+    return [f"Islands are {apart} texels apart at {_RESOLUTION} × {_RESOLUTION}."]
 
 
 def _convexity(mesh: MeshData, certified: WrittenMap) -> tuple[NDArray[np.int64], str]:

@@ -20,7 +20,12 @@ LETTER = "R"
 def declare_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument(
-        "-o", "--output", type=Path, default=Path("qhm-demo"), metavar="DIR", help="folder to write to (qhm-demo)"
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("qhm-demo"),
+        metavar="DIR",
+        help="folder to write to (default: qhm-demo)",
     )
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 def declare_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    add_files(parser, ".npy, .nii, .nii.gz, .mha or .nrrd file", "file to write, of the same kind")
+    add_files(parser, ".npy, .nii, .nii.gz, .mha or .nrrd file", "file to write, of the same kind as the input")
     add_options(
         parser,
         inverse=file(

@@ -50,7 +50,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         **declare_options(FlattenOptions),
         weights=file("file of triangle weights, one positive number per line"),
         start=flag("start from the map in the input's texture coordinates (vt)"),
-        fixed=file("file of vertices, 0-based, one per line, to fix at the input's vt"),
+        fixed=file("file of vertices to fix at their positions in the input's vt, 0-based, one per line"),
     )
     add_options(
         parser,
@@ -59,7 +59,10 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         pattern=file("also draw the outline true to scale, as .svg or .dxf"),
         unit=choice(("mm", "cm", "m", "in"), "length unit of the surface, for --pattern (default: mm)"),
         allowance=number(
-            float, "distance of the cutting line outside the outline, in that unit", metavar="WIDTH", default=0.0
+            float,
+            "distance of the cutting line outside the outline, in the unit of --unit",
+            metavar="WIDTH",
+            default=0.0,
         ),
     )
     add_options(parser, "linear_solver", "texture", "json", "surface")

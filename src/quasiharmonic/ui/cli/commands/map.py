@@ -54,10 +54,13 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         f"{format_names('write_map')} file to write",
     )
     map_options.add_options(parser)
-    kind = "for --plot: draw that (default), or the surface and the map coloured by max(σ₁, 1/σ₂) with its histogram"
+    kind = (
+        "for --plot: map, as described there (default); distortion: the surface and the map coloured by "
+        "max(σ₁, 1/σ₂), and its histogram"
+    )
     add_options(
         parser,
-        plot=file("draw the rest surface, the start and the map", metavar="IMAGE"),
+        plot=file("image to write: the surface, the initial map and the map", metavar="IMAGE"),
         kind=choice(("map", "distortion"), kind),
     )
     add_options(parser, "islands", "pack", "resolution", "padding", "texture", "json", "surface")
@@ -65,8 +68,8 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_mutually_exclusive_group(),
         polish=choice(
             ENERGIES,
-            "then lower distortion until it converges: %(choices)s (default: 20 steps of blend, up to "
-            "100,000 triangles)",
+            "lower the distortion of the injective map until it converges: %(choices)s (default: 20 steps of blend, "
+            "up to 100,000 triangles)",
             metavar="ENERGY",
         ),
         no_polish=flag("keep the first injective map"),

@@ -62,16 +62,14 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         group=in_order(
             str,
             "NAME",
-            "move the nodes of a physical group of Gmsh or a named set; the motions that follow are applied in their "
-            "order; without any, the group stays. Repeat for several groups",
+            "move the nodes of a physical group of Gmsh or a named set; the motions after it are applied in their "
+            "order; without motions the group is fixed; repeat for several groups",
         ),
         positions=file(
             "file of target positions: lines 'vertex,x,y', or 'vertex,x,y,z' for tetrahedra, counting from 0",
             metavar="CSV",
         ),
-        field=text(
-            "NAME", "point data of the mesh with the displacements of boundary vertices; the last time step counts"
-        ),
+        field=text("NAME", "point data of the mesh with the displacements of boundary vertices, of the last time step"),
     )
     add_options(parser, **MOTIONS)
     add_options(
@@ -82,8 +80,8 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         energy=choice(ENERGIES, "energy to lower (default: symmetric-dirichlet)"),
         no_polish=flag("keep the first valid mesh"),
         slide=flag(
-            "let boundary vertices without a displacement slide along the boundary, its corners stay fixed; in space "
-            "along all flat parts of the boundary"
+            "let boundary vertices without a displacement slide along the boundary between its corners; for "
+            "tetrahedra, along all flat parts of the boundary"
         ),
         slide_plane=number(
             float,

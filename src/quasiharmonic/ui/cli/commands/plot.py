@@ -1,12 +1,14 @@
 """``qhm plot``: draw the map of a file.
 
-Draw the map that the input's texture coordinates (vt) give, injective or not.
+Draw the map that the input's texture coordinates (vt) give, injective or not. A displacement field is drawn with its
+folds, and a finite-element mesh with its element quality.
 
 Exit status: 0 the image is written; 2 wrong input or call, nothing written.
 
     qhm plot map.obj -o map.png
     qhm plot map.obj --kind distortion --measure area_ratio -o distortion.svg
-    qhm plot model.glb --kind texture -o model.png
+    qhm plot model.glb --kind unwrap -o model.png
+    qhm plot field.npy -o folds.png
 """
 
 from __future__ import annotations
@@ -23,17 +25,23 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser.add_argument("input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map")
+    parser.add_argument(
+        "input",
+        type=Path,
+        metavar="FILE",
+        help=f"{format_names('write_map')} file with a map, a "
+        "finite-element mesh, or a displacement field (.npy, .nii, .nii.gz, .mha, .nrrd)",
+    )
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="IMAGE", help="image to write: .png, .svg or .pdf"
     )
     add_options(
         parser,
         kind=choice(
-            ("map", "distortion", "texture"),
+            ("map", "distortion", "texture", "unwrap"),
             "map: the surface and the map, inverted triangles in red (default); distortion: both coloured by a "
             "measure, and its histogram; texture: the surface with the model's own texture, --texture, or a "
-            "checkerboard",
+            "checkerboard; unwrap: the charts, and the surface with a checkerboard, the stretch and the texel density",
         ),
         measure=choice(MEASURES, "measure for --kind distortion: %(choices)s (default: isometric)", metavar="NAME"),
         texture=text(
@@ -48,12 +56,27 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read and draw."""
     from quasiharmonic import io
-    from quasiharmonic.ui.plot import save_distortion_figure, save_map_figure, save_texture_figure
+    from quasiharmonic.io.fields import FIELD_SUFFIXES, read_field
+    from quasiharmonic.ui.plot import (
+        plot_field,
+        plot_unwrap,
+        save_distortion_figure,
+        save_map_figure,
+        save_texture_figure,
+    )
+    from quasiharmonic.ui.plot.canvas import save_picture
 
     image = None if options.texture in (None, CHECKERBOARD) else Path(options.texture)
     report.check_picture("-o", options.output, inputs=(options.input, image))
     if finite_elements.has_elements(options.input):
         return finite_elements.plot(options)
+    if options.input.name.lower().endswith(FIELD_SUFFIXES):
+        if (options.kind, options.measure, options.texture) != (None, None, None):
+            raise ValueError(f"{options.input} is a displacement field: omit --kind, --measure and --texture")
+        given = read_field(options.input)
+        with report.name_source(options.input):
+            save_picture(options.output, plot_field(given.field, spacing=given.spacing))
+        return report.tell_written(options.output)
     shows_measure = options.kind == "distortion"
     set_default(options, "measure", "isometric", asked=shows_measure, belongs="--kind distortion")
     if options.texture is not None and options.kind not in (None, "texture"):
@@ -63,6 +86,8 @@ def run(options: argparse.Namespace) -> int:
     with report.name_source(options.input):
         if options.kind == "distortion":
             save_distortion_figure(options.output, V, F, uv, options.measure)
+        elif options.kind == "unwrap":
+            save_picture(options.output, plot_unwrap(V, F, uv))
         elif options.kind == "texture" or options.texture is not None:
             texture = io.own_texture(mesh) if options.texture is None else image
             save_texture_figure(options.output, V, F, uv, texture=texture)

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any, TypeAlias
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
     from quasiharmonic.energies.measures import Distortion
     from quasiharmonic.io import MeshData
@@ -38,13 +41,15 @@ if TYPE_CHECKING:
 
     Lower: TypeAlias = Callable[[SeamedMesh, dict[str, Any]], MappedAtlas]
 
-# Energies that `distortion` measures: their names in reports, and the measures.
-_MEASURED = {
-    "symmetric-dirichlet": ("symmetric Dirichlet", "symmetric_dirichlet"),
-    "mips": ("MIPS", "mips"),
-    "arap": ("ARAP", "arap"),
-    "arap-barrier": ("ARAP", "arap"),
-    "arap-unsigned": ("ARAP", "arap"),
+# Energies: their names in reports, and their values on each triangle in terms of measured distortion.
+_MEASURED: dict[str, tuple[str, Callable[[Distortion], NDArray[np.float64]]]] = {
+    "symmetric-dirichlet": ("symmetric Dirichlet", lambda found: found.symmetric_dirichlet),
+    "mips": ("MIPS", lambda found: found.mips),
+    "blend": ("blend", lambda found: (127 * found.mips + found.area_ratio + 1 / found.area_ratio - 2) / 128),
+    "arap": ("ARAP", lambda found: found.arap),
+    "arap-barrier": ("ARAP", lambda found: found.arap),
+    "arap-unsigned": ("ARAP", lambda found: found.arap),
+    "area": ("squared error of areas", lambda found: (found.area_ratio - 1) ** 2),
 }
 
 
@@ -57,7 +62,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
     add_options(
         parser,
         fixed=file(
-            "file of fixed vertices, 0-based, one per line (default: the boundary; with --slide none but the corners)"
+            "file of fixed vertices, 0-based, one per line (default: the boundary; with --slide only the corners)"
         ),
         **declare_options(PolishOptions),
         free=flag("free the boundary; each island stays near its position"),
@@ -147,11 +152,11 @@ def lower_distortion(
 
 
 def _change(energy: str, before: Distortion, after: Distortion) -> str:
-    """Return a sentence about the change of the energy that was lowered, if it is a measure, and of lengths."""
+    """Return a sentence about the change of the energy that was lowered, if it is measured, and of lengths."""
     lengths = [found.statistics("isometric").maximum for found in (before, after)]
     words = f"isometric distortion from {lengths[0]:.3g} to {lengths[1]:.3g} at worst"
     if energy in _MEASURED:
         name, measure = _MEASURED[energy]
-        means = [found.statistics(measure).mean for found in (before, after)]
+        means = [float(found.share @ measure(found)) for found in (before, after)]
         words = f"{name} from {means[0]:.3g} to {means[1]:.3g} on average, {words}"
     return words

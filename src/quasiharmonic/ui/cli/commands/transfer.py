@@ -53,16 +53,16 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         "-o",
         "--output",
         **file(
-            "write the target with its vertices moved to the corresponding points of the source: its triangles, and "
-            f"the source's shape; as {format_names('write_map', 'seams')}"
+            "file to write: the target, its vertices moved to the corresponding points of the source; "
+            f"{format_names('write_map', 'seams')}"
         ),
     )
     pair = {"nargs": 2, "metavar": ("FILE", "OUT")}
     add_options(
         parser,
         values=file(
-            f"transfer values of the source to the target's vertices: {', '.join(_TABLES)} (one row per vertex or "
-            "triangle), or GIFTI data to read",
+            f"values of the source to transfer to the target's vertices: {', '.join(_TABLES)} (one row per vertex or "
+            "triangle), or GIFTI data",
             **pair,
         ),
         per=choice(

@@ -40,6 +40,7 @@ from quasiharmonic.ui.cli.arguments import (
     texture_size,
     weld,
 )
+from quasiharmonic.util.optional import with_extra
 from quasiharmonic.util.options import INSTANCES, BakeOptions, UnwrapOptions
 
 if TYPE_CHECKING:
@@ -82,8 +83,8 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         ),
         hard_edges=number(
             _hard_edges,
-            "seams at all edges with a larger angle between the normals, in degrees; file: at those with split normals "
-            "or between smoothing groups",
+            "make all edges seams that have a larger angle between the normals, in degrees; file: the edges with "
+            "split normals or between smoothing groups",
             metavar="ANGLE",
         ),
         seams=file("file of edges that become seams: two vertices, 0-based, on each line"),
@@ -99,12 +100,12 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         ),
         channel=number(
             steps,
-            "write the new texture coordinates as number N, such as 1 for lightmaps, and keep those below "
-            "(default: 0); GLB, glTF, PLY",
+            "set of texture coordinates to write, such as 1 for lightmaps; the sets below are kept (default: 0); "
+            "GLB, glTF, PLY",
             default=0,
         ),
         seams_channel=number(
-            steps, "which of the file's texture coordinates --keep-seams keeps (default: 0)", default=0
+            steps, "set of the file's texture coordinates whose seams --keep-seams keeps (default: 0)", default=0
         ),
         bake=flag("bake the look of the model into textures for the new texture coordinates"),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
@@ -327,7 +328,7 @@ def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) 
     from quasiharmonic.ui.batch.supervisor import resident
 
     if resident(os.getpid()) is None:
-        raise ValueError("--memory needs psutil on this system: pip install psutil")
+        raise ValueError(f"--memory needs psutil on this system: pip install {with_extra('batch')}")
 
     def check(step: UnwrapStep) -> None:
         used = resident(os.getpid())

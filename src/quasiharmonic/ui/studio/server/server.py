@@ -1,7 +1,8 @@
 """Web server of the application: static files, and one worker process for each open page.
 
 The server listens only on this machine. Every request needs the token in the address, which other sites do not know.
-Requests with another host name are refused, which prevents DNS rebinding. Sockets from other origins are refused too.
+Requests with another host name are rejected, which prevents DNS rebinding. Sockets from other origins
+are rejected, too.
 """
 
 from __future__ import annotations

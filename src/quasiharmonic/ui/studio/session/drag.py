@@ -31,7 +31,7 @@ REACH = 0.08
 
 
 class DragMap(NamedTuple):
-    """Map of a drag."""
+    """The map that a page shows during a drag."""
 
     uv: FloatArray  # (n, 2): an injective map
     certificate: Certificate  # Its exact certificate

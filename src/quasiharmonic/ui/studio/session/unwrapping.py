@@ -77,7 +77,7 @@ def unwrap_model(
             options["edge_costs"] = Given(costs, public(polygon_costs)(model))
     if which := given.get("labels"):
         if source.start is not None:
-            raise RequestError("parts of the file are known only in the file as opened: undo, or choose no parts")
+            raise RequestError("the file's parts are unknown after the mesh has changed: undo, or choose no parts")
         words = _LABELS[which]
         labels = statement_labels(sheet.mesh, *words)
         options["labels"] = Given(labels, public(statement_labels)(model, *words), {"labels": which})
