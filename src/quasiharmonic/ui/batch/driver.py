@@ -24,7 +24,16 @@ from quasiharmonic.ui.batch.loose import LooseProblems
 from quasiharmonic.ui.batch.pool import solve_in_processes
 from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, group_small
 from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
-from quasiharmonic.ui.batch.shards import WHOLE, Shard, lock_folder, lock_name, read_shard, shard_of, table_name
+from quasiharmonic.ui.batch.shards import (
+    WHOLE,
+    Shard,
+    lock_folder,
+    lock_name,
+    marker_name,
+    read_shard,
+    shard_of,
+    table_name,
+)
 from quasiharmonic.ui.batch.supervisor import Finished, resident
 from quasiharmonic.util.arrays import check_callback, check_instance, check_integer
 from quasiharmonic.util.optional import with_extra
@@ -45,6 +54,9 @@ class DataSet(Protocol):
 
     def collect(self, item: Finished | None) -> Iterable[Finished]:
         """Keep the results of an item of the pool, if there is one; return the problems that are finished."""
+
+    def close(self) -> None:
+        """Keep the results of problems that are finished but not collected, as after an interrupt."""
 
     def records(self) -> Iterator[records.Record]:
         """Yield the records of the finished problems."""
@@ -235,7 +247,7 @@ def _solve(
         if callback is not None:
             callback(progress)
 
-    with closing(finished):
+    with closing(data), closing(finished):
         for item in finished:
             count(data.collect(item))
         count(data.collect(None))
@@ -277,17 +289,19 @@ def _check_folder(folder: Path) -> None:
 
 
 def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings, part: Shard) -> None:
-    """Write the marker file with source, settings and version into the run's folder, and delete old tables."""
+    """Write the marker files with source, settings and version into the run's folder, and delete old tables."""
     with writing(f"to {folder}"):
         for path in folder.glob("records*"):
             # The table of the last run must not be taken for that of this run, nor the tables of other shards.
             shard = shard_of(path.name)
             if shard is not None and (part == WHOLE or shard in (WHOLE, part)):
                 remove_file(path)
+                if part == WHOLE != shard:
+                    remove_file(folder / marker_name(shard))
     location = os.fspath(source) if places.is_url(source) else os.path.abspath(source)
     about = {"source": location, "settings": settings.to_dict(), "version": __version__}
     contents = json.dumps(about, indent=2).encode() + b"\n"
-    marker = folder / MARKER
-    # Other shards write the same contents.
-    if part == WHOLE or not marker.exists() or marker.read_bytes() != contents:
-        write_whole(marker, contents)
+    # Shards of the same run write the same contents; `merge` compares the markers of all shards.
+    for marker in {folder / MARKER, folder / marker_name(part)}:
+        if part == WHOLE or not marker.exists() or marker.read_bytes() != contents:
+            write_whole(marker, contents)

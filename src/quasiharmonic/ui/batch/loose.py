@@ -45,6 +45,9 @@ class LooseProblems:
         """Return the problems that are finished with an item of the pool."""
         return () if item is None else (item,)
 
+    def close(self) -> None:
+        """Do nothing: finished results are in their folders."""
+
     def records(self) -> Iterator[records.Record]:
         """Yield the records of the finished problems."""
         for files in self.problems():

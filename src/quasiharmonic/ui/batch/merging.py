@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.lowlevel.atomic import new_folder, write_whole
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.problems import MARKER
-from quasiharmonic.ui.batch.shards import WHOLE, Shard, lock_folder, lock_name, shard_of, table_name
+from quasiharmonic.ui.batch.shards import WHOLE, Shard, lock_folder, lock_name, marker_name, shard_of, table_name
 from quasiharmonic.util.untrusted import parse_json
 
 
@@ -53,7 +53,7 @@ def merge(sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[s
     Raises
     ------
     ValueError
-        If a folder has no tables, the folders have different settings, the tables belong to different numbers of
+        If a folder has no tables, the tables have different settings, the tables belong to different numbers of
         shards, or two of them belong to the same shard.
     MeshFileError
         If a table cannot be read.
@@ -68,7 +68,7 @@ def merge(sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[s
     target = folder / table_name(WHOLE, table)
     records.check_table(target)
     tables, missing = _find_tables(folders, target)
-    marker = _common_marker(folders)
+    marker = _common_marker(tables)
     found = {"total": 0, "solved": 0}
 
     def rows() -> Iterator[records.Record]:
@@ -109,17 +109,28 @@ def _find_tables(folders: Sequence[Path], target: Path) -> tuple[list[Path], tup
     return ordered + others, tuple(f"{shard.number}/{shard.total}" for shard in missing)
 
 
-def _common_marker(folders: Sequence[Path]) -> bytes:
-    """Return the contents of the folders' marker file; ValueError if their settings differ."""
-    first, contents = None, b""
-    for folder in folders:
+def _common_marker(tables: Sequence[Path]) -> bytes:
+    """Return the contents of the marker files of the tables; ValueError if their settings differ."""
+    first: tuple[Path, dict[str, Any]] | None = None
+    contents = b""
+    for table in tables:
+        marker = table.with_name(marker_name(shard_of(table.name) or WHOLE))
+        if not marker.exists():
+            marker = table.with_name(MARKER)
         try:
-            here = (folder / MARKER).read_bytes()
+            here = marker.read_bytes()
             settings = parse_json(here)["settings"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{folder} is not the folder of a run: it has no valid {MARKER}") from error
+            settings.items()
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{table.parent} is not the folder of a run: it has no valid {marker.name}") from error
         if first is None:
-            first, contents = (folder, settings), here
-        elif settings != first[1]:
-            raise ValueError(f"{first[0]} and {folder} have different settings: merge runs with the same settings")
+            first, contents = (table, settings), here
+        others = first[1]
+        differing = [name for name in {**others, **settings} if others.get(name) != settings.get(name)]
+        if differing:
+            listed = ", ".join(f"{name} ({others.get(name)} and {settings.get(name)})" for name in differing)
+            raise ValueError(
+                f"{first[0]} and {table} have different settings, {listed}: solve one of them again with the settings "
+                "of the other"
+            )
     return contents

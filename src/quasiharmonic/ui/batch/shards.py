@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from quasiharmonic.io.errors import OutputError
 from quasiharmonic.io.lowlevel.atomic import writing
+from quasiharmonic.ui.batch.problems import MARKER
 from quasiharmonic.util.arrays import describe
 
 
@@ -62,6 +63,11 @@ def shard_of(name: str) -> Shard | None:
     """Return the shard of a manifest's file name, `WHOLE` for that of the whole data set; None for other files."""
     found = re.fullmatch(r"records(?:-([0-9]+)-of-([0-9]+))?\.(?:csv|parquet)", name)
     return None if found is None else Shard(int(found[1] or 1), int(found[2] or 1))
+
+
+def marker_name(shard: Shard) -> str:
+    """Return the name of the marker file of a shard, or of the whole data set, in the run's folder."""
+    return MARKER if shard == WHOLE else MARKER.replace(".json", f"-{shard.label}.json")
 
 
 def lock_name(part: Shard) -> str:

@@ -122,12 +122,19 @@ class ArchivedProblems:
         """
         with self._lock:
             if item is not None:
-                self._journal(item)
+                self._journal(item.name)
                 self._ready.append(item)
             for opened in [one for one in self._opened if one.read and not one.waiting]:
                 self._finish(opened)
             ready, self._ready = self._ready, []
             return ready
+
+    def close(self) -> None:
+        """Keep the results that are finished but not collected, as after an interrupt."""
+        with self._lock:
+            for name, extracted in list(self._extracted.items()):
+                if records.read_record(extracted.folder) is not None:
+                    self._journal(name)
 
     def records(self) -> Iterator[records.Record]:
         """Yield the records of all finished problems, in the order of the archives."""
@@ -210,8 +217,8 @@ class ArchivedProblems:
                 fixed_path.write_bytes(sample.files[fixed])
         return ProblemFiles(names["problem"], mesh_path, fixed_path, results=folder, source=names["source"])
 
-    def _journal(self, item: Finished) -> None:
-        opened, key, folder = self._extracted.pop(item.name)
+    def _journal(self, name: str) -> None:
+        opened, key, folder = self._extracted[name]
         record = records.read_record(folder)
         if record is None:
             opened.lost = True
@@ -219,8 +226,9 @@ class ArchivedProblems:
             if record.get("error"):
                 record["error"] = record["error"].replace(str(folder), record["source"])
             path = records.map_path(folder, self._form)
-            data = path.read_bytes() if record.get("map_bytes") is not None and path.exists() else None
+            data = None if record.get("map_bytes") is None else records.read_map(path)
             opened.journal.add(results.Result(key, record, data, self._form))
+        del self._extracted[name]
         opened.waiting -= 1
         with suppress(OSError):  # in use by another program: the folder is not used again
             records.remove_results(folder)

@@ -253,6 +253,7 @@ class Journal:
         self.path = path
         self.part = path.with_name(path.name + PART)
         self.entries: dict[str, _Entry] = {}
+        self._end = 0  # Offset after the last whole result
         with writing(self.part):
             path.parent.mkdir(parents=True, exist_ok=True)
             if not self.part.exists() and path.exists():
@@ -272,9 +273,11 @@ class Journal:
         """Append a result; OutputError if it cannot be written."""
         packed = _pack_result(*result)
         with writing(self.part), open(self.part, "ab") as file:
-            start = file.tell()
+            # An interrupt may have left a part of a result.
+            file.truncate(self._end)
             file.write(packed)
-        self._note(result.key, start, start + len(packed), result.record)
+        start, self._end = self._end, self._end + len(packed)
+        self._note(result.key, start, self._end, result.record)
 
     def finish(self, order: Sequence[str], stamp: str, settings: str, form: str) -> None:
         """Write the finished archive with maps of a format, in the given order of names, and delete the journal."""
@@ -290,17 +293,17 @@ class Journal:
         self.entries[key] = _Entry(start, end, {name: record[name] for name in _KEPT if name in record})
 
     def _repair(self) -> None:
-        """Read the journal and cut off the bytes after the last complete result."""
+        """Read the journal, without results whose maps are damaged, and cut off the bytes after the last whole one."""
         if not self.part.exists():
             return
         with open(self.part, "r+b") as file:
-            end = 0
-            for one in read_tar_results(file, maps=False):
+            for one in read_tar_results(file):
                 if one.result is None:
                     break
-                self._note(one.result.key, one.start, one.end, one.result.record)
-                end = one.end
-            file.truncate(end)
+                if records.is_intact(one.result.record, one.result.data):
+                    self._note(one.result.key, one.start, one.end, one.result.record)
+                self._end = one.end
+            file.truncate(self._end)
 
 
 def _read_entries(file: BinaryIO, entries: Iterable[_Entry]) -> Iterator[Result]:

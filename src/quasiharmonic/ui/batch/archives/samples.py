@@ -86,6 +86,10 @@ def read_samples(path: Path, limit: int | None = None) -> Iterator[Sample]:
 
 def _check(sample: Sample, seen: set[str]) -> None:
     """Set the error of a sample that cannot be used."""
+    first, second = (name.partition(".")[2] for name in INPUTS)
+    if first in sample.files:
+        # As in a folder.
+        sample.files.pop(second, None)
     meshes = [extension for extension in sample.files if _is_mesh(extension)]
     if sample.key in seen:
         sample.key, sample.error = (
