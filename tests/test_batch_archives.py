@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 
 from quasiharmonic import batch, io
-from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.archives import places
-from quasiharmonic.ui.batch.archives.finding import find_archives
-from quasiharmonic.ui.batch.archives.results import Journal, Result, read_about, read_results
-from quasiharmonic.ui.batch.archives.samples import read_samples
-from quasiharmonic.ui.batch.archives.tar_stream import Damage, read_members
+from quasiharmonic.ui.batch import places, records
+from quasiharmonic.ui.batch.readers import find_archives
+from quasiharmonic.ui.batch.results import Result, read_about, read_results
+from quasiharmonic.ui.batch.samples import read_samples
+from quasiharmonic.ui.batch.tar_stream import Damage, read_members
+from quasiharmonic.ui.batch.writers import Journal
 from quasiharmonic.ui.cli import main
 from shared.commands import linux
 from shared.datasets import lasting, record_of, write_stars

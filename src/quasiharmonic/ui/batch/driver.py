@@ -5,24 +5,22 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Any
 
 from quasiharmonic import __version__
 from quasiharmonic.io.errors import OutputError, check_path
 from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole, writing
-from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.archives import places
-from quasiharmonic.ui.batch.archives.archived import ArchivedProblems, scratch_folder
-from quasiharmonic.ui.batch.archives.finding import find_archives
-from quasiharmonic.ui.batch.archives.outputs import Outputs
-from quasiharmonic.ui.batch.loose import LooseProblems
+from quasiharmonic.ui.batch import places, records
+from quasiharmonic.ui.batch.dataset import DataSet, Part, scratch_folder
 from quasiharmonic.ui.batch.pool import solve_in_processes
-from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, group_small
+from quasiharmonic.ui.batch.problems import MARKER, group_small
+from quasiharmonic.ui.batch.readers import FolderReader, Scratch, find_archives
+from quasiharmonic.ui.batch.samples import results_name
 from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
 from quasiharmonic.ui.batch.shards import (
     WHOLE,
@@ -35,31 +33,10 @@ from quasiharmonic.ui.batch.shards import (
     table_name,
 )
 from quasiharmonic.ui.batch.supervisor import Finished, resident
+from quasiharmonic.ui.batch.writers import ArchiveWriter, FolderWriter
 from quasiharmonic.util.arrays import check_callback, check_instance, check_integer
 from quasiharmonic.util.optional import with_extra
 from quasiharmonic.util.threads import count_cores
-
-
-class DataSet(Protocol):
-    """Problems of a run: files in folders (`LooseProblems`), or archives (`ArchivedProblems`)."""
-
-    orders: Orders
-
-    @property
-    def total(self) -> int:
-        """Number of problems; may be an estimate during the run."""
-
-    def problems(self) -> Iterator[ProblemFiles]:
-        """Yield the problems."""
-
-    def collect(self, item: Finished | None) -> Iterable[Finished]:
-        """Keep the results of an item of the pool, if there is one; return the problems that are finished."""
-
-    def close(self) -> None:
-        """Keep the results of problems that are finished but not collected, as after an interrupt."""
-
-    def records(self) -> Iterator[records.Record]:
-        """Yield the records of the finished problems."""
 
 
 @dataclass
@@ -204,17 +181,20 @@ def run(
         folder = orders.output
         table_path = folder / table_name(part, table)
         records.check_table(table_path)
-        loose = None if archives else LooseProblems(source, orders, part)
+        reader = FolderReader(source, part)
+        count = None if archives else reader.count(orders)
         _check_folder(folder)
         lock = lock_name(part)
         stack.enter_context(new_folder(folder, leftovers=frozenset({lock})))
         stack.enter_context(lock_folder(folder, lock))
         _prepare(folder, source, settings, part)
-        if loose is None:
+        parts, scratch = [Part(reader, FolderWriter(reader, orders))], folder
+        if archives:
+            names = frozenset(results_name(one.name) for one in archives)
+            mine = [one for one in archives if part.contains(one.name)]
+            parts = [Part(one, ArchiveWriter(one, orders, url, names)) for one in mine]
             scratch = stack.enter_context(scratch_folder(folder, part, shared=scheduler is not None))
-            data: DataSet = ArchivedProblems(archives, orders, part, Outputs(folder, url), scratch)
-        else:
-            data = loose
+        data = DataSet(parts, orders, Scratch(scratch), count)
         progress = _solve(data, jobs, scheduler, began, callback)
         records.write_table(table_path, data.records())
         if url is not None:
