@@ -72,7 +72,8 @@ def test_finished_models_are_skipped_unless_an_option_changes(models, tmp_path):
 
 
 @linux
-def test_a_killed_run_is_continued(models, tmp_path):
+@pytest.mark.parametrize(("how", "status"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 2)])
+def test_a_stopped_run_is_continued(models, tmp_path, capsys, how, status):
     for k in range(6):
         io.write_obj(models / f"more{k}.obj", io.MeshData(V * (k + 2), F))
     out = tmp_path / "out"
@@ -81,11 +82,12 @@ def test_a_killed_run_is_continued(models, tmp_path):
     while not list(out.glob("results/*/record.json")):
         assert process.poll() is None
         time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.send_signal(how)
+    assert process.wait() == status
     finished = len(list(out.glob("results/**/record.json")))
-    assert run(*command) == 1
     assert finished > 0
+    assert run(*command) == 1
+    assert f"{finished} of them done before" in capsys.readouterr().out
     rows = list(batch.read_table(out / "records.csv"))
     assert len(rows) == 10
     assert sum(row["certified"] is True for row in rows) == 8
