@@ -23,7 +23,7 @@ _PREFIX = "qhm-batch-"
 
 
 @dataclass
-class Part:
+class Stream:
     """Reader and writer of the same problems: of an archive, or of all problems in folders."""
 
     reader: FolderReader | ArchiveReader
@@ -37,7 +37,7 @@ class DataSet:
 
     Parameters
     ----------
-    parts : sequence of Part
+    streams : sequence of Stream
         Readers and their writers.
     orders : Orders
         Parameters of the run.
@@ -47,12 +47,12 @@ class DataSet:
         Number of problems, if it is known.
     """
 
-    def __init__(self, parts: Sequence[Part], orders: Orders, scratch: Scratch, count: int | None = None) -> None:
+    def __init__(self, streams: Sequence[Stream], orders: Orders, scratch: Scratch, count: int | None = None) -> None:
         self.orders = orders
-        self._parts, self._scratch, self._count = parts, scratch, count
+        self._streams, self._scratch, self._count = streams, scratch, count
         self._lock = threading.RLock()  # `problems` runs in other threads than the other methods
-        self._pending: dict[str, tuple[Part, ProblemFiles]] = {}
-        self._opened: list[Part] = []
+        self._pending: dict[str, tuple[Stream, ProblemFiles]] = {}
+        self._opened: list[Stream] = []
         self._ready: list[Finished] = []
         self._known = self._in_read = self._read = 0
 
@@ -62,23 +62,23 @@ class DataSet:
         with self._lock:
             if self._count is not None:
                 return self._count
-            unread = len(self._parts) - self._read
+            unread = len(self._streams) - self._read
             return max(self._known, self._in_read + round(unread * self._in_read / max(self._read, 1)))
 
     def problems(self) -> Iterator[ProblemFiles]:
         """Yield the problems to solve; those of archives are unpacked when they are asked for."""
-        for part in self._parts:
+        for stream in self._streams:
             try:
-                yield from self._problems_of(part)
+                yield from self._problems_of(stream)
             except OutputError:
                 raise
             except OSError as error:
-                part.writer.fail(error)
+                stream.writer.fail(error)
                 with self._lock:
-                    self._ready.append(Finished(part.reader.name, "error", 0.0))
+                    self._ready.append(Finished(stream.reader.name, "error", 0.0))
                     self._known += 1
             with self._lock:
-                part.read = True
+                stream.read = True
                 self._read += 1
                 self._in_read = self._known
 
@@ -88,9 +88,9 @@ class DataSet:
             if item is not None:
                 self._keep(item.name)
                 self._ready.append(item)
-            for part in [one for one in self._opened if one.read and not one.waiting]:
-                self._opened.remove(part)
-                part.writer.finish()
+            for stream in [one for one in self._opened if one.read and not one.waiting]:
+                self._opened.remove(stream)
+                stream.writer.finish()
             ready, self._ready = self._ready, []
             return ready
 
@@ -103,48 +103,48 @@ class DataSet:
 
     def records(self) -> Iterator[records.Record]:
         """Yield the records of the finished problems."""
-        for part in self._parts:
-            yield from part.writer.records()
+        for stream in self._streams:
+            yield from stream.writer.records()
 
-    def _problems_of(self, part: Part) -> Iterator[ProblemFiles]:
-        found = part.writer.find_finished()
+    def _problems_of(self, stream: Stream) -> Iterator[ProblemFiles]:
+        found = stream.writer.find_finished()
         with self._lock:
             if found is not None:
-                name = part.reader.name
+                name = stream.reader.name
                 self._ready += [Finished(name, outcome, 0.0, resumed=True) for outcome in found.elements()]
                 self._known += found.total()
                 return
-            part.writer.open()
-            self._opened.append(part)
-        for files in part.reader.problems(self.orders, self._scratch):
+            stream.writer.open()
+            self._opened.append(stream)
+        for files in stream.reader.problems(self.orders, self._scratch):
             with self._lock:
                 self._known += 1
-                finished = self._find_finished(part, files)
+                finished = self._find_finished(stream, files)
                 if finished is None:
-                    part.waiting += 1
-                    self._pending[files.name] = part, files
+                    stream.waiting += 1
+                    self._pending[files.name] = stream, files
                 else:
                     self._ready.append(finished)
                     self._release(files)
             if finished is None:
                 yield files
 
-    def _find_finished(self, part: Part, files: ProblemFiles) -> Finished | None:
+    def _find_finished(self, stream: Stream, files: ProblemFiles) -> Finished | None:
         """Return the report of a problem that an earlier run has finished, or that cannot be used; else None."""
-        before = part.writer.resume(files)
+        before = stream.writer.resume(files)
         if files.error is not None:
             names = {"problem": files.name, "source": files.source}
-            part.writer.add(files, names | {"outcome": "invalid", "certified": False, "error": files.error})
+            stream.writer.add(files, names | {"outcome": "invalid", "certified": False, "error": files.error})
             return Finished(files.name, "invalid", 0.0)
         key = "" if before is None else self.orders.settings.key(files)
         return None if before is None else find_resumed(files.name, before, key, self.orders)
 
     def _keep(self, name: str) -> None:
         """Let the writer keep the results of a problem."""
-        part, files = self._pending[name]
-        part.writer.add(files, None if files.results is None else records.read_record(files.results))
+        stream, files = self._pending[name]
+        stream.writer.add(files, None if files.results is None else records.read_record(files.results))
         del self._pending[name]
-        part.waiting -= 1
+        stream.waiting -= 1
         self._release(files)
 
     def _release(self, files: ProblemFiles) -> None:

@@ -16,7 +16,7 @@ from quasiharmonic import __version__
 from quasiharmonic.io.errors import OutputError, check_path
 from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole, writing
 from quasiharmonic.ui.batch import places, records
-from quasiharmonic.ui.batch.dataset import DataSet, Part, scratch_folder
+from quasiharmonic.ui.batch.dataset import DataSet, Stream, scratch_folder
 from quasiharmonic.ui.batch.pool import solve_in_processes
 from quasiharmonic.ui.batch.problems import MARKER, group_small
 from quasiharmonic.ui.batch.readers import FolderReader, Scratch, find_archives
@@ -188,13 +188,13 @@ def run(
         stack.enter_context(new_folder(folder, leftovers=frozenset({lock})))
         stack.enter_context(lock_folder(folder, lock))
         _prepare(folder, source, settings, part)
-        parts, scratch = [Part(reader, FolderWriter(reader, orders))], folder
+        streams, scratch = [Stream(reader, FolderWriter(reader, orders))], folder
         if archives:
             names = frozenset(results_name(one.name) for one in archives)
             mine = [one for one in archives if part.contains(one.name)]
-            parts = [Part(one, ArchiveWriter(one, orders, url, names)) for one in mine]
+            streams = [Stream(one, ArchiveWriter(one, orders, url, names)) for one in mine]
             scratch = stack.enter_context(scratch_folder(folder, part, shared=scheduler is not None))
-        data = DataSet(parts, orders, Scratch(scratch), count)
+        data = DataSet(streams, orders, Scratch(scratch), count)
         progress = _solve(data, jobs, scheduler, began, callback)
         records.write_table(table_path, data.records())
         if url is not None:
