@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io as streams
+import re
 import signal
 import subprocess
 import sys
@@ -121,6 +122,14 @@ def test_the_command_reports_charts_and_cleaning(models, tmp_path, capsys):
     assert "Distribution of distortion" not in page
     expected = unwrap(V, F, max_stretch=1.3, resolution=(256, 128), symmetry=None)
     assert record_of(out, "clean.obj")["charts"] == expected.n_charts
+
+
+def test_the_report_shows_that_a_model_has_no_seams(tmp_path):
+    row = {"problem": "a", "outcome": "bijective", "certified": True, "charts": 1, "seam_length": 0.0, "stretch": 1.0}
+    batch.write_table(tmp_path / "records.csv", [row])
+    assert run("batch", "-o", tmp_path / "records.csv", "--report") == 0
+    cells = re.findall("<td[^>]*>([^<]*)</td>", (tmp_path / "report.html").read_text().partition("<th>charts</th>")[2])
+    assert cells[:5] == ["a", "1", "0", "1", "–"]
 
 
 def test_other_settings_are_an_error(models, tmp_path, capsys):

@@ -191,8 +191,8 @@ def run(
         streams, scratch = [Stream(reader, FolderWriter(reader, orders))], folder
         if archives:
             names = frozenset(results_name(one.name) for one in archives)
-            mine = [one for one in archives if part.contains(one.name)]
-            streams = [Stream(one, ArchiveWriter(one, orders, url, names)) for one in mine]
+            mine, key = [one for one in archives if part.contains(one.name)], settings.key_of(b"", b"")
+            streams = [Stream(one, ArchiveWriter(one, orders, url, names, key)) for one in mine]
             scratch = stack.enter_context(scratch_folder(folder, part, shared=scheduler is not None))
         data = DataSet(streams, orders, Scratch(scratch), count)
         progress = _solve(data, jobs, scheduler, began, callback)

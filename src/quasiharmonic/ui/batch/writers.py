@@ -51,16 +51,16 @@ class FolderWriter:
         self._reader, self._orders = reader, orders
 
     def find_finished(self) -> Counter[str] | None:
-        """Return the numbers of outcomes if all problems are known to be finished; workers find out here."""
+        """Return the numbers of outcomes if all problems are known to be finished, before they are read; else None."""
 
     def open(self) -> None:
         """Prepare for results."""
 
     def resume(self, files: ProblemFiles) -> Record | None:
-        """Announce the next problem; return the values of its record that workers do not find themselves."""
+        """Note the next problem; return its record of an earlier run, if the supervisor does not read this itself."""
 
     def add(self, files: ProblemFiles, record: Record | None) -> None:
-        """Keep the results of a problem, which may have failed to write its record."""
+        """Keep the results of a problem; it has no record if that could not be written."""
 
     def fail(self, error: OSError) -> None:
         """Note that the problems cannot be read; raise the error if the run cannot continue."""
@@ -90,16 +90,20 @@ class ArchiveWriter:
         Where finished archives are sent. If None, they are kept in the run's folder.
     present : frozenset of str
         Names of the results of all archives of the data set.
+    key : str
+        Digest of the settings.
     """
 
-    def __init__(self, archive: ArchiveReader, orders: Orders, url: str | None, present: frozenset[str]) -> None:
+    def __init__(
+        self, archive: ArchiveReader, orders: Orders, url: str | None, present: frozenset[str], key: str
+    ) -> None:
         self._archive, self._orders, self._present, self._sent = archive, orders, present, url is not None
         self._name = results_name(archive.name)
         self._folder = orders.output / "results"
         self._path = self._folder / self._name
         # Where the finished archive is.
         self._location = str(self._path) if url is None else places.join(url, f"results/{self._name}")
-        self._key, self._form = orders.settings.key_of(b"", b""), orders.settings.map_format
+        self._key, self._form = key, orders.settings.map_format
         self._order: list[str] = []  # Names of the problems so far
         self._lost = False  # Whether a problem has no record
         self._failure: str | None = None
@@ -145,9 +149,12 @@ class ArchiveWriter:
         self._lost, self._failure = True, str(error)
 
     def finish(self) -> None:
+        journal, order = self._journal, self._order
+        # Memory must not grow with the number of problems.
+        del self._journal, self._order
         if self._lost:
             return
-        self._journal.finish(self._order, self._stamp, self._key, self._form)
+        journal.finish(order, self._stamp, self._key, self._form)
         if self._sent:
             places.send(self._path, self._location)
             self._path.unlink()
