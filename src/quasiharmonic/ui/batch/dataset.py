@@ -13,7 +13,7 @@ from pathlib import Path
 from quasiharmonic.io.errors import OutputError
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.problems import ProblemFiles
-from quasiharmonic.ui.batch.readers import ArchiveReader, FolderReader
+from quasiharmonic.ui.batch.readers import ArchiveReader, FolderReader, Scratch
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.shards import Shard
 from quasiharmonic.ui.batch.supervisor import Finished, find_resumed
@@ -41,13 +41,13 @@ class DataSet:
         Readers and their writers.
     orders : Orders
         Parameters of the run.
-    scratch : Path
-        Folder for the files of problems from archives that are being solved.
+    scratch : Scratch
+        Folders for the files of problems from archives that are being solved.
     count : int, optional
         Number of problems, if it is known.
     """
 
-    def __init__(self, streams: Sequence[Stream], orders: Orders, scratch: Path, count: int | None = None) -> None:
+    def __init__(self, streams: Sequence[Stream], orders: Orders, scratch: Scratch, count: int | None = None) -> None:
         self.orders = orders
         self._streams, self._scratch, self._count = streams, scratch, count
         self._lock = threading.RLock()  # `problems` runs in other threads than the other methods
@@ -125,7 +125,7 @@ class DataSet:
                     self._pending[files.name] = stream, files
                 else:
                     self._ready.append(finished)
-                    _remove_files(files)
+                    self._release(files)
             if finished is None:
                 yield files
 
@@ -145,13 +145,14 @@ class DataSet:
         stream.writer.add(files, None if files.results is None else records.read_record(files.results))
         del self._pending[name]
         stream.waiting -= 1
-        _remove_files(files)
+        self._release(files)
 
-
-def _remove_files(files: ProblemFiles) -> None:
-    """Remove the unpacked files of a problem, and its results."""
-    if files.results is not None:
-        shutil.rmtree(files.results, ignore_errors=True)
+    def _release(self, files: ProblemFiles) -> None:
+        """Let another problem use the folder with the files of a problem from an archive."""
+        if files.results is not None:
+            with suppress(OSError):  # in use by another program: the folder is not used again
+                records.remove_results(files.results)
+                self._scratch.free(files.results)
 
 
 @contextmanager

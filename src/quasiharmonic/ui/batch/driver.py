@@ -19,7 +19,7 @@ from quasiharmonic.ui.batch import places, records
 from quasiharmonic.ui.batch.dataset import DataSet, Stream, scratch_folder
 from quasiharmonic.ui.batch.pool import solve_in_processes
 from quasiharmonic.ui.batch.problems import MARKER, group_small
-from quasiharmonic.ui.batch.readers import FolderReader, find_archives
+from quasiharmonic.ui.batch.readers import FolderReader, Scratch, find_archives
 from quasiharmonic.ui.batch.samples import results_name
 from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
 from quasiharmonic.ui.batch.shards import (
@@ -194,7 +194,7 @@ def run(
             mine, key = [one for one in archives if part.contains(one.name)], settings.key_of(b"", b"")
             streams = [Stream(one, ArchiveWriter(one, orders, url, names, key)) for one in mine]
             scratch = stack.enter_context(scratch_folder(folder, part, shared=scheduler is not None))
-        data = DataSet(streams, orders, scratch, count)
+        data = DataSet(streams, orders, Scratch(scratch), count)
         progress = _solve(data, jobs, scheduler, began, callback)
         records.write_table(table_path, data.records())
         if url is not None:

@@ -25,6 +25,32 @@ _MANY = 10_000_000
 _SCRATCH = "to the folder for temporary files"
 
 
+class Scratch:
+    """Folders for the files of problems that are being solved.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder that contains them.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._free: list[Path] = []  # Folders of finished problems; a new one takes longer than a file
+
+    def take(self) -> Path:
+        """Return an empty folder; OutputError if it cannot be made."""
+        try:
+            return self._free.pop()
+        except IndexError:
+            with writing(_SCRATCH):
+                return Path(tempfile.mkdtemp(dir=self._folder))
+
+    def free(self, folder: Path) -> None:
+        """Keep an empty folder for another problem."""
+        self._free.append(folder)
+
+
 class FolderReader(NamedTuple):
     """Problems in folders, as `find_problems` finds them, or those of a shard."""
 
@@ -32,7 +58,7 @@ class FolderReader(NamedTuple):
     shard: Shard
     name: str = ""  # As for archives: the names of the problems begin with it
 
-    def problems(self, orders: Orders, _scratch: Path | None = None) -> Iterator[ProblemFiles]:
+    def problems(self, orders: Orders, _scratch: Scratch | None = None) -> Iterator[ProblemFiles]:
         """Yield the problems, in the order of their names."""
         found = find_problems(self.source, plain=orders.settings.plain)
         return (files for files in found if self.shard.contains(files.name))
@@ -63,15 +89,15 @@ class ArchiveReader(NamedTuple):
     name: str  # Path in the data set, parts separated by "/": unique, and equal in every run
     location: str  # Absolute path or URL
 
-    def problems(self, orders: Orders, scratch: Path) -> Iterator[ProblemFiles]:
-        """Yield the problems; their files are written to new folders in ``scratch`` when they are asked for.
+    def problems(self, orders: Orders, scratch: Scratch) -> Iterator[ProblemFiles]:
+        """Yield the problems; their files are written to folders of ``scratch`` when they are asked for.
 
         OutputError if they cannot be written, OSError if the archive cannot be read.
         """
-        copy = _new_folder(scratch)
+        copy = scratch.take()
         try:
             for sample in read_samples(places.fetch(self.location, copy), orders.memory_limit):
-                yield self._extract(sample, _new_folder(scratch), orders)
+                yield self._extract(sample, scratch, orders)
         finally:
             shutil.rmtree(copy, ignore_errors=True)
 
@@ -79,8 +105,8 @@ class ArchiveReader(NamedTuple):
         """Return the columns of a record that name a problem of the archive."""
         return {"problem": f"{self.name}/{key}", "source": f"{self.location}/{key}"}
 
-    def _extract(self, sample: Sample, folder: Path, orders: Orders) -> ProblemFiles:
-        mesh, fixed = sample.mesh, None if orders.settings.plain else sample.fixed
+    def _extract(self, sample: Sample, scratch: Scratch, orders: Orders) -> ProblemFiles:
+        folder, mesh, fixed = scratch.take(), sample.mesh, None if orders.settings.plain else sample.fixed
         # The name of the member may be unsuitable for this system.
         mesh_path = folder / f"mesh.{(mesh or '').rpartition('.')[2]}"
         fixed_path = None if fixed is None else folder / "fixed.txt"
@@ -93,11 +119,6 @@ class ArchiveReader(NamedTuple):
         return ProblemFiles(
             names["problem"], mesh_path, fixed_path, results=folder, source=names["source"], error=sample.error
         )
-
-
-def _new_folder(scratch: Path) -> Path:
-    with writing(_SCRATCH):
-        return Path(tempfile.mkdtemp(dir=scratch))
 
 
 def find_archives(source: str | os.PathLike[str], *, plain: bool) -> list[ArchiveReader]:

@@ -170,9 +170,14 @@ def clear(folder: Path) -> None:
         try:
             folder.mkdir(parents=True)
         except FileExistsError:
-            maps = [map_path(folder, form) for form in MAP_FORMATS]
-            for path in (folder / FILE, *maps, *folder.glob(".qhm-*.tmp")):
-                remove_file(path)
+            remove_results(folder)
+
+
+def remove_results(folder: Path) -> None:
+    """Delete the results in a folder, the record first; OSError if that fails."""
+    maps = [map_path(folder, form) for form in MAP_FORMATS]
+    for path in (folder / FILE, *maps, *folder.glob(".qhm-*.tmp")):
+        remove_file(path)
 
 
 def describe_contents(data: bytes) -> Record:
