@@ -16,11 +16,12 @@ from pathlib import Path
 import pytest
 
 from quasiharmonic import batch, io
-from quasiharmonic.ui.batch.archives import places
-from quasiharmonic.ui.batch.archives.finding import find_archives
-from quasiharmonic.ui.batch.archives.results import Journal, Result, read_about, read_results
-from quasiharmonic.ui.batch.archives.samples import read_samples
-from quasiharmonic.ui.batch.archives.tar_stream import Damage, read_members
+from quasiharmonic.ui.batch import places, records
+from quasiharmonic.ui.batch.readers import find_archives
+from quasiharmonic.ui.batch.results import Result, read_about, read_results
+from quasiharmonic.ui.batch.samples import read_samples
+from quasiharmonic.ui.batch.tar_stream import Damage, read_members
+from quasiharmonic.ui.batch.writers import Journal
 from quasiharmonic.ui.cli import main
 from shared.commands import linux
 from shared.datasets import lasting, record_of, write_stars
@@ -99,6 +100,16 @@ class TestSamples:
         ]  # fmt: skip
         assert [one.files[one.mesh] for one in found] == [b"1", b"3", b"5"]
 
+    def test_obj_counts_before_ply_as_in_folders(self, tmp_path):
+        files = [("a/input.ply", b"1"), ("a/input.obj", b"2"), ("b.obj", b"3"), ("b.ply", b"4")]
+        found = list(read_samples(write_tar(tmp_path / "a.tar", files)))
+        assert [(one.key, one.error, one.mesh, one.files) for one in found] == [
+            ("a", None, "obj", {"obj": b"2"}), ("b", None, "obj", {"obj": b"3"}),
+        ]  # fmt: skip
+        for name in ("input.ply", "input.obj"):
+            (tmp_path / name).touch()
+        assert io.problem_files(tmp_path)[0].name == "input.obj"
+
     def test_unusable_problems_have_errors(self, tmp_path):
         files = [("a.obj", b""), ("b.txt", b""), ("a.obj", b""), ("c.v1.obj", b""), ("c.v2.obj", b"")]
         errors = [one.error for one in read_samples(write_tar(tmp_path / "a.tar", files))]
@@ -130,7 +141,17 @@ class TestSamples:
 
 class TestJournal:
     def result(self, name, data, form="obj"):
-        return Result(name, {"problem": name, "outcome": "injective", "key": "0", "seconds": 0.1}, data, form)
+        record = {"problem": name, "outcome": "injective", "key": "0", "seconds": 0.1}
+        return Result(name, record | ({} if data is None else records.describe_contents(data)), data, form)
+
+    def test_a_damaged_map_counts_as_missing(self, tmp_path):
+        journal = Journal(tmp_path / "r.tar")
+        for name in "abc":
+            journal.add(self.result(name, name.encode() * 30))
+        data = journal.part.read_bytes()
+        journal.part.write_bytes(data.replace(b"b" * 30, b"b" * 20 + bytes(10)))
+        assert list(Journal(tmp_path / "r.tar").entries) == ["a", "c"]
+        assert journal.part.stat().st_size == len(data)
 
     @pytest.mark.slow
     def test_cut_anywhere_it_continues(self, tmp_path):
@@ -263,7 +284,8 @@ class TestRun:
         assert not (out / "results/0.tar").exists()
 
     @linux
-    def test_killed_and_continued(self, tmp_path, stars):
+    @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+    def test_stopped_and_continued(self, tmp_path, stars, how):
         source, _ = stars
         write_tar(tmp_path / "set.tar", samples_of(source, "abcdef"))
         # One of the problems is slow, so that the others are finished before the run is killed.
@@ -279,19 +301,43 @@ class TestRun:
             assert process.poll() is None
             assert time.monotonic() < end
             time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
         (note,) = out.glob("*.scratch")
         scratch = Path(note.read_text())
         assert scratch.exists()
-        # As if the system had written the last result in part.
-        with open(part, "r+b") as file:
-            file.truncate(part.stat().st_size - 700)
+        process.send_signal(how)
+        if how == signal.SIGINT:
+            assert process.wait() == 2
+            assert not scratch.exists()
+            finished = len(list(read_results(part)))
+        else:
+            assert process.wait() == -how
+            assert scratch.exists()
+            # As if the system had written the last result in part.
+            with open(part, "r+b") as file:
+                file.truncate(part.stat().st_size - 700)
+            finished = len(list(read_results(part)))
         progress = batch.run(tmp_path / "set.tar", out, jobs=1)
         assert progress.outcomes == {"injective": 7}
-        assert 0 < progress.resumed < 6
+        assert progress.resumed == finished > 0
         assert not scratch.exists()
         assert not part.exists()
+
+    def test_an_interrupt_keeps_results_that_are_not_collected(self, tmp_path, stars):
+        source, _ = stars
+        write_tar(tmp_path / "set.tar", samples_of(source, "abcdef"))
+
+        def interrupt(progress):
+            if progress.done:
+                scratch = Path(next((tmp_path / "out").glob("*.scratch")).read_text())
+                end = time.monotonic() + 60
+                while len(list(scratch.rglob("record.json"))) < 6 - progress.done:
+                    assert time.monotonic() < end
+                    time.sleep(0.01)
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            batch.run(tmp_path / "set.tar", tmp_path / "out", jobs=1, callback=interrupt)
+        assert batch.run(tmp_path / "set.tar", tmp_path / "out", jobs=1).resumed == 6
 
     def test_failures_are_tried_again_if_asked_for(self, tmp_path, failing_worker):
         source = write_stars(tmp_path / "set", ["a", "bug"], rings=3)

@@ -53,6 +53,11 @@ def test_problems_that_kill_workers_are_identified_and_affect_no_other(tmp_path)
         progress = batch.run(source, tmp_path / "out", scheduler=address)
         assert progress.outcomes == {"injective": 4, "crash": 1}
         assert "died" in record_of(tmp_path / "out", "poison")["error"]
+        # The scheduler notices the end of a worker before its parent process does.
+        end = time.monotonic() + 60
+        while sum(not worker.is_alive() for worker in workers) < 2:
+            assert time.monotonic() < end
+            time.sleep(0.01)
         assert sum(not worker.is_alive() for worker in workers) == 2
     assert batch.run(source, tmp_path / "out").resumed == 5
 

@@ -81,6 +81,21 @@ class TestArray:
         with pytest.raises(ValueError, match="no table of records"):
             batch.merge([source], tmp_path / "all")
 
+    def test_shards_with_different_settings_are_not_merged(self, tmp_path, capsys):
+        source, out = write_stars(tmp_path / "set", list("abcdef"), rings=3), tmp_path / "out"
+        batch.run(source, out, batch.Settings(max_iterations=90), jobs=1, shard="1/2")
+        batch.run(source, out, jobs=1, shard="2/2")
+        assert main(["batch", "-o", str(out), "--merge"]) == 2
+        said = capsys.readouterr().err
+        assert "records-1-of-2.csv and " in said
+        assert "records-2-of-2.csv have different settings, --max-iterations (90 and 2000): " in said
+        assert not (out / "records.csv").exists()
+        batch.run(source, out, jobs=1, shard="1/2")
+        assert batch.merge([out], out) == (6, 6, ())
+        # A run of all problems replaces the shards.
+        batch.run(source, out, batch.Settings(max_iterations=90), jobs=1)
+        assert [path.name for path in out.glob("*.json")] == ["qhm-batch.json"]
+
 
 class TestSlots:
     def test_the_limit_falls_and_rises(self):

@@ -59,13 +59,17 @@ class TestTables:
         with pytest.raises(ValueError, match=r"csv or .parquet"):
             list(records.read_table(tmp_path / "t.xls"))
 
-    def test_a_missing_map_is_made_again(self, stars, tmp_path):
+    def test_a_missing_or_damaged_map_is_made_again(self, stars, tmp_path):
         out = tmp_path / "out"
         batch.run(stars / "a", out)
         (record,) = (out / "results").rglob("record.json")
         maps = [path for path in record.parent.iterdir() if path != record]
         assert batch.run(stars / "a", out).resumed == 1
-        for spoil in (lambda path: path.write_bytes(path.read_bytes()[:-9]), lambda path: path.unlink()):
+        for spoil in (
+            lambda path: path.write_bytes(path.read_bytes()[:-9]),
+            lambda path: path.write_bytes(path.read_bytes()[:-9] + bytes(9)),
+            lambda path: path.unlink(),
+        ):
             whole = [path.read_bytes() for path in maps]
             for path in maps:
                 spoil(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io as streams
+import re
 import signal
 import subprocess
 import sys
@@ -72,7 +73,8 @@ def test_finished_models_are_skipped_unless_an_option_changes(models, tmp_path):
 
 
 @linux
-def test_a_killed_run_is_continued(models, tmp_path):
+@pytest.mark.parametrize(("how", "status"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 2)])
+def test_a_stopped_run_is_continued(models, tmp_path, capsys, how, status):
     for k in range(6):
         io.write_obj(models / f"more{k}.obj", io.MeshData(V * (k + 2), F))
     out = tmp_path / "out"
@@ -81,11 +83,12 @@ def test_a_killed_run_is_continued(models, tmp_path):
     while not list(out.glob("results/*/record.json")):
         assert process.poll() is None
         time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.send_signal(how)
+    assert process.wait() == status
     finished = len(list(out.glob("results/**/record.json")))
-    assert run(*command) == 1
     assert finished > 0
+    assert run(*command) == 1
+    assert f"{finished} of them done before" in capsys.readouterr().out
     rows = list(batch.read_table(out / "records.csv"))
     assert len(rows) == 10
     assert sum(row["certified"] is True for row in rows) == 8
@@ -119,6 +122,14 @@ def test_the_command_reports_charts_and_cleaning(models, tmp_path, capsys):
     assert "Distribution of distortion" not in page
     expected = unwrap(V, F, max_stretch=1.3, resolution=(256, 128), symmetry=None)
     assert record_of(out, "clean.obj")["charts"] == expected.n_charts
+
+
+def test_the_report_shows_that_a_model_has_no_seams(tmp_path):
+    row = {"problem": "a", "outcome": "bijective", "certified": True, "charts": 1, "seam_length": 0.0, "stretch": 1.0}
+    batch.write_table(tmp_path / "records.csv", [row])
+    assert run("batch", "-o", tmp_path / "records.csv", "--report") == 0
+    cells = re.findall("<td[^>]*>([^<]*)</td>", (tmp_path / "report.html").read_text().partition("<th>charts</th>")[2])
+    assert cells[:5] == ["a", "1", "0", "1", "–"]
 
 
 def test_other_settings_are_an_error(models, tmp_path, capsys):

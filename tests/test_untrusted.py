@@ -17,7 +17,7 @@ from quasiharmonic.io import MeshData, MeshFileError
 from quasiharmonic.io.fields import check_header
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.archives.samples import read_samples
+from quasiharmonic.ui.batch.samples import read_samples
 from quasiharmonic.util.untrusted import check_gifti, parse_json, read_npy, resolve_beside, unpack_gzip, use_bound
 
 NESTED = b"[" * 100_000

@@ -4,10 +4,10 @@ The package builds on `solver` and `apps`. Start reading in `driver`, then `work
 """
 
 from quasiharmonic.ui.batch.driver import Progress, run
-from quasiharmonic.ui.batch.merging import Merged, merge
 from quasiharmonic.ui.batch.problems import ProblemFiles, find_problems
 from quasiharmonic.ui.batch.records import COLUMNS, OUTCOMES, read_table, write_table
 from quasiharmonic.ui.batch.settings import Settings
+from quasiharmonic.ui.batch.shards import Merged, merge
 from quasiharmonic.ui.batch.supervisor import WorkerError
 
 __all__ = [

@@ -5,49 +5,38 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Protocol
+from typing import Any
 
 from quasiharmonic import __version__
 from quasiharmonic.io.errors import OutputError, check_path
 from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole, writing
-from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.archives import places
-from quasiharmonic.ui.batch.archives.archived import ArchivedProblems, scratch_folder
-from quasiharmonic.ui.batch.archives.finding import find_archives
-from quasiharmonic.ui.batch.archives.outputs import Outputs
-from quasiharmonic.ui.batch.loose import LooseProblems
+from quasiharmonic.ui.batch import places, records
+from quasiharmonic.ui.batch.dataset import DataSet, Stream, scratch_folder
 from quasiharmonic.ui.batch.pool import solve_in_processes
-from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, group_small
+from quasiharmonic.ui.batch.problems import MARKER, group_small
+from quasiharmonic.ui.batch.readers import FolderReader, Scratch, find_archives
+from quasiharmonic.ui.batch.samples import results_name
 from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
-from quasiharmonic.ui.batch.shards import WHOLE, Shard, lock_folder, lock_name, read_shard, shard_of, table_name
+from quasiharmonic.ui.batch.shards import (
+    WHOLE,
+    Shard,
+    lock_folder,
+    lock_name,
+    marker_name,
+    read_shard,
+    shard_of,
+    table_name,
+)
 from quasiharmonic.ui.batch.supervisor import Finished, resident
+from quasiharmonic.ui.batch.writers import ArchiveWriter, FolderWriter
 from quasiharmonic.util.arrays import check_callback, check_instance, check_integer
 from quasiharmonic.util.optional import with_extra
 from quasiharmonic.util.threads import count_cores
-
-
-class DataSet(Protocol):
-    """Problems of a run: files in folders (`LooseProblems`), or archives (`ArchivedProblems`)."""
-
-    orders: Orders
-
-    @property
-    def total(self) -> int:
-        """Number of problems; may be an estimate during the run."""
-
-    def problems(self) -> Iterator[ProblemFiles]:
-        """Yield the problems."""
-
-    def collect(self, item: Finished | None) -> Iterable[Finished]:
-        """Keep the results of an item of the pool, if there is one; return the problems that are finished."""
-
-    def records(self) -> Iterator[records.Record]:
-        """Yield the records of the finished problems."""
 
 
 @dataclass
@@ -192,17 +181,20 @@ def run(
         folder = orders.output
         table_path = folder / table_name(part, table)
         records.check_table(table_path)
-        loose = None if archives else LooseProblems(source, orders, part)
+        reader = FolderReader(source, part)
+        count = None if archives else reader.count(orders)
         _check_folder(folder)
         lock = lock_name(part)
         stack.enter_context(new_folder(folder, leftovers=frozenset({lock})))
         stack.enter_context(lock_folder(folder, lock))
         _prepare(folder, source, settings, part)
-        if loose is None:
+        streams, scratch = [Stream(reader, FolderWriter(reader, orders))], folder
+        if archives:
+            names = frozenset(results_name(one.name) for one in archives)
+            mine, key = [one for one in archives if part.contains(one.name)], settings.key_of(b"", b"")
+            streams = [Stream(one, ArchiveWriter(one, orders, url, names, key)) for one in mine]
             scratch = stack.enter_context(scratch_folder(folder, part, shared=scheduler is not None))
-            data: DataSet = ArchivedProblems(archives, orders, part, Outputs(folder, url), scratch)
-        else:
-            data = loose
+        data = DataSet(streams, orders, Scratch(scratch), count)
         progress = _solve(data, jobs, scheduler, began, callback)
         records.write_table(table_path, data.records())
         if url is not None:
@@ -235,7 +227,7 @@ def _solve(
         if callback is not None:
             callback(progress)
 
-    with closing(finished):
+    with closing(data), closing(finished):
         for item in finished:
             count(data.collect(item))
         count(data.collect(None))
@@ -277,17 +269,19 @@ def _check_folder(folder: Path) -> None:
 
 
 def _prepare(folder: Path, source: str | os.PathLike[str], settings: Settings, part: Shard) -> None:
-    """Write the marker file with source, settings and version into the run's folder, and delete old tables."""
+    """Write the marker files with source, settings and version into the run's folder, and delete old tables."""
     with writing(f"to {folder}"):
         for path in folder.glob("records*"):
             # The table of the last run must not be taken for that of this run, nor the tables of other shards.
             shard = shard_of(path.name)
             if shard is not None and (part == WHOLE or shard in (WHOLE, part)):
                 remove_file(path)
+                if part == WHOLE != shard:
+                    remove_file(folder / marker_name(shard))
     location = os.fspath(source) if places.is_url(source) else os.path.abspath(source)
     about = {"source": location, "settings": settings.to_dict(), "version": __version__}
     contents = json.dumps(about, indent=2).encode() + b"\n"
-    marker = folder / MARKER
-    # Other shards write the same contents.
-    if part == WHOLE or not marker.exists() or marker.read_bytes() != contents:
-        write_whole(marker, contents)
+    # Shards of the same run write the same contents; `merge` compares the markers of all shards.
+    for marker in {folder / MARKER, folder / marker_name(part)}:
+        if part == WHOLE or not marker.exists() or marker.read_bytes() != contents:
+            write_whole(marker, contents)

@@ -17,7 +17,7 @@ from quasiharmonic import __version__
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.ui.batch.records import Record, describe_contents
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
@@ -54,7 +54,7 @@ def describe_map(path: Path, required: str, certified: bool, bijective: bool, in
         "certified": certified,
         "bijective": bijective,
         "flips_after": inverted,
-        "map_bytes": path.stat().st_size,
+        **describe_contents(path.read_bytes()),
     }
 
 

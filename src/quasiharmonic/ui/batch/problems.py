@@ -44,6 +44,8 @@ class ProblemFiles:
         Absolute path of the folder for its map and record; by default ``results/NAME`` in the run's folder.
     source : str or None
         Source of the problem for its record; by default ``mesh``.
+    error : str or None
+        Why the problem cannot be used, if this is known.
     """
 
     name: str
@@ -51,6 +53,7 @@ class ProblemFiles:
     fixed: Path | None
     results: Path | None = None
     source: str | None = None
+    error: str | None = None
 
 
 def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Iterator[ProblemFiles]:

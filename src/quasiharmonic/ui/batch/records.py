@@ -10,6 +10,7 @@ import io
 import json
 import os
 from collections.abc import Iterable, Iterator
+from hashlib import blake2b
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -102,7 +103,9 @@ COLUMNS: dict[str, type] = {
     "error": str,
     # Digest of the input and the settings.
     "key": str,
+    # Length and digest of the written map.
     "map_bytes": int,
+    "map_digest": str,
 }
 
 #: File names of the tables of a run.
@@ -121,7 +124,7 @@ def map_path(folder: Path, form: str) -> Path:
 def write_map(path: Path, mesh: MeshData) -> None:
     """Write a map without waiting for the disk, which would take longer than most problems.
 
-    `is_complete` detects truncated files. OutputError if it cannot be written.
+    `is_intact` detects truncated and damaged files. OutputError if it cannot be written.
     """
     (write_ply if path.suffix == ".ply" else write_obj)(path, mesh, durable=False)
 
@@ -177,14 +180,22 @@ def remove_results(folder: Path) -> None:
         remove_file(path)
 
 
-def is_complete(path: Path, record: Record) -> bool:
-    """Whether the map of a record exists at a path and has the recorded length."""
-    if record.get("map_bytes") is None:
-        return True
+def describe_contents(data: bytes) -> Record:
+    """Return the part of a record that identifies the contents of its map."""
+    return {"map_bytes": len(data), "map_digest": blake2b(data, digest_size=8).hexdigest()}
+
+
+def read_map(path: Path) -> bytes | None:
+    """Return the contents of a map; None if it cannot be read."""
     try:
-        return path.stat().st_size == record["map_bytes"]
+        return path.read_bytes()
     except OSError:
-        return False
+        return None
+
+
+def is_intact(record: Record, data: bytes | None) -> bool:
+    """Whether a record has no map, or these are the contents of its map."""
+    return record.get("map_bytes") is None or (data is not None and describe_contents(data).items() <= record.items())
 
 
 def write_table(path: str | os.PathLike[str], records: Iterable[Record]) -> None:

@@ -110,8 +110,10 @@ class Supervisor:
             return _conclude(folder, known | {"outcome": "invalid", "error": str(error)}, 0.0)
         before = None if again else records.read_record(folder)
         finished = None if before is None else find_resumed(files.name, before, known["key"], orders)
-        if before is not None and finished is not None and records.is_complete(orders.map_path(folder), before):
-            return finished
+        if before is not None and finished is not None:
+            data = records.read_map(orders.map_path(folder))
+            if records.is_intact(before, data):
+                return finished
         return {
             "mesh": str(files.mesh),
             "fixed": None if files.fixed is None else str(files.fixed),
@@ -225,7 +227,7 @@ def _conclude(folder: Path, record: Record, seconds: float) -> Finished:
 def find_resumed(name: str, record: Record, key: str, orders: Orders) -> Finished | None:
     """Return the report of a problem that an earlier run has finished; None if its record has not this key, or is void.
 
-    The map of the record must be complete.
+    The map of the record must be intact.
     """
     if record.get("key") != key or not is_valid(record, orders):
         return None
@@ -233,7 +235,7 @@ def find_resumed(name: str, record: Record, key: str, orders: Orders) -> Finishe
 
 
 def is_valid(record: Record, orders: Orders) -> bool:
-    """Whether an existing record of the same input and settings is valid for these orders, if its map is complete."""
+    """Whether an existing record of the same input and settings is valid for these orders, if its map is intact."""
     outcome = record["outcome"]
     if outcome in records.JUDGED or outcome == "invalid":
         return True

@@ -144,10 +144,7 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -
     with metadata.time_phase(record, "read"), use_bound(job["record"].get("memory_limit")):
         mesh = io.read_mesh(job["mesh"])
     if settings["unwrap"] is not None:
-        # SciPy's subpackages that this needs would double the time in which workers for maps start.
-        from quasiharmonic.ui.batch import unwrapped_models
-
-        unwrapped_models.unwrap_model(mesh, settings["unwrap"], path, record, tell)
+        _unwrap_model(mesh, settings["unwrap"], path, record, tell)
         return
     with metadata.time_phase(record, "read"):
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))
@@ -172,6 +169,33 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -
         record |= _write_map(path, mapped, "bijective" if settings["flatten"] else "injective")
     with metadata.time_phase(record, "measure"):
         record |= metadata.measure(*io.without_idle(*io.cut_at_seams(mapped)))
+
+
+def _unwrap_model(mesh: io.MeshData, options: dict[str, Any], path: Path, record: Record, tell: Tell) -> None:
+    """Unwrap a model with options of `quasiharmonic.unwrap`, write it to ``path``, and record the certified facts."""
+    # SciPy's subpackages that this needs would double the time in which workers for maps start.
+    from quasiharmonic.apps.unwrapping.model_files import add_map, is_written, polygon_costs
+    from quasiharmonic.apps.unwrapping.unwrap import unwrap
+
+    sizes = {"vertices": len(mesh.V), "triangles": len(mesh.F)}
+    tell({"facts": record | sizes})
+    with metadata.time_phase(record, "map"):
+        result = unwrap(mesh.V, mesh.F, edge_costs=polygon_costs(mesh), jobs=record.get("threads"), **options)
+    changes = result.cleaned.changes.items()
+    stretch = {"stretch": result.stretch.p99, "isometric": result.stretch.worst}
+    record |= {
+        **sizes,
+        **{name: value if isfinite(value) else None for name, value in stretch.items()},
+        "charts": result.n_charts,
+        "seam_length": result.seam_length,
+        "utilisation": result.utilisation,
+        "cleaned": ", ".join(f"{name}: {rows.size}" for name, rows in changes if rows.size) or None,
+        "status": result.status.name.lower(),
+    }
+    with metadata.time_phase(record, "write"):
+        records.write_map(path, add_map(mesh, result)[0])
+        certified = result.success and is_written(io.read_mesh(path), result)
+    record |= metadata.describe_map(path, "bijective", certified, certified, None)
 
 
 def _map_islands(

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from quasiharmonic import io
 from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.archives.results import find_map
 from quasiharmonic.ui.batch.records import Record
+from quasiharmonic.ui.batch.results import find_map
 from quasiharmonic.util.arrays import FloatArray, scale_to_unit
 from quasiharmonic.util.options import MAP_FORMATS
 

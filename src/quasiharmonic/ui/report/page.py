@@ -173,7 +173,10 @@ def _describe_unwraps(run: BatchRun) -> str:
     lines = [
         (
             escape_text(row["problem"]),
-            *(number(float(row.get(name) or np.nan)) for name in ("charts", "seam_length", "stretch", "utilisation")),
+            *(
+                number(np.nan if row.get(name) is None else float(row[name]))
+                for name in ("charts", "seam_length", "stretch", "utilisation")
+            ),
             escape_text(row.get("cleaned") or "–"),
         )
         for row in rows

@@ -146,7 +146,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the data set with progress, then print a summary and write the report page."""
     from quasiharmonic.ui import batch
-    from quasiharmonic.ui.batch.archives import places
+    from quasiharmonic.ui.batch import places
     from quasiharmonic.ui.batch.shards import read_shard, table_name
 
     if options.against is not None and not options.report:

@@ -2,24 +2,23 @@
 
 A tar file has ``NAME.obj`` or ``NAME.ply``, the map, and ``NAME.json``, the record, for each problem. A Parquet file
 has the columns of the records and ``obj`` or ``ply``. The metadata of both identify the input and the settings.
-
-A journal keeps the results of an archive that is not finished, in the order in which they were found.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import os
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, NamedTuple
 
-from quasiharmonic.io.lowlevel.atomic import write_whole, writing
+from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.archives.samples import KEYS, PARQUET, is_archive
-from quasiharmonic.ui.batch.archives.tar_stream import (
+from quasiharmonic.ui.batch.places import fetch, read_start
+from quasiharmonic.ui.batch.records import Record, load_pyarrow
+from quasiharmonic.ui.batch.samples import KEYS, is_archive, is_parquet, results_name
+from quasiharmonic.ui.batch.tar_stream import (
     END_MARK,
     Damage,
     Member,
@@ -29,7 +28,6 @@ from quasiharmonic.ui.batch.archives.tar_stream import (
     pack_member,
     read_members,
 )
-from quasiharmonic.ui.batch.records import Record, load_pyarrow
 from quasiharmonic.util.options import MAP_FORMATS
 from quasiharmonic.util.untrusted import parse_json
 
@@ -37,12 +35,10 @@ from quasiharmonic.util.untrusted import parse_json
 PART = ".part"
 # Extension of a record.
 _RECORD = ".json"
-#: Bytes at the start of a tar file with its metadata.
-MAX_ABOUT = 1 << 16
+# Bytes at the start of a tar file with its metadata.
+_MAX_ABOUT = 1 << 16
 _MARK = b"quasiharmonic"
 _ROWS = 64
-# Keys of a record that are kept, to decide whether it is still valid, and to count it in the archive's metadata.
-_KEPT = "key", "outcome", "time_limit", "memory_limit", "seconds"
 
 
 class Result(NamedTuple):
@@ -54,56 +50,27 @@ class Result(NamedTuple):
     form: str  # Format of the map, one of `MAP_FORMATS`
 
 
-def results_name(name: str) -> str:
-    """Return the name of the results of an archive: results are not compressed."""
-    for suffix in (".tar.gz", ".tgz"):
-        if name.lower().endswith(suffix):
-            return name[: -len(suffix)] + ".tar"
-    return name
-
-
-def is_parquet(path: Path) -> bool:
-    """Whether a path is that of a Parquet file."""
-    return path.name.lower().endswith(PARQUET)
-
-
-def read_about(path: Path) -> dict[str, Any] | None:
-    """Return the metadata of an archive of results; None if it is missing or invalid."""
+def read_about(location: str) -> dict[str, Any] | None:
+    """Return the metadata of an archive of results, a path or URL; None if it is missing or invalid."""
     try:
-        if is_parquet(path):
-            with load_pyarrow().ParquetFile(path) as parquet:
-                text = (parquet.schema_arrow.metadata or {}).get(_MARK, b"").decode()
+        if is_parquet(location):
+            with TemporaryDirectory() as folder:
+                text = _read_mark(fetch(location, Path(folder)))
         else:
-            with open(path, "rb") as file:
-                text = global_comment(file.read(MAX_ABOUT))
-    except (OSError, ValueError):
-        return None
-    return parse_about(text)
-
-
-def parse_about(text: str | None) -> dict[str, Any] | None:
-    """Return the metadata in a text; None if they are missing or invalid."""
-    try:
-        about = parse_json(text or "")
-    except ValueError:
+            text = global_comment(read_start(location, _MAX_ABOUT) or b"") or ""
+        about = parse_json(text)
+    except (FileNotFoundError, ValueError):
         return None
     return about if isinstance(about, dict) and {"stamp", "settings", "outcomes"} <= set(about) else None
 
 
-def describe(found: Iterable[Record], stamp: str, settings: str) -> dict[str, Any]:
-    """Return the metadata of an archive of results.
-
-    ``found`` are its records, ``stamp`` identifies the version of its archive of problems, and ``settings`` is their
-    digest.
-    """
-    counts = Counter((one["outcome"], one.get("time_limit"), one.get("memory_limit")) for one in found)
-    return {"stamp": stamp, "settings": settings, "outcomes": [[*kind, count] for kind, count in counts.items()]}
-
-
-def outcomes(about: dict[str, Any]) -> Iterator[tuple[Record, int]]:
-    """Yield outcome and limits of the records that the metadata count, and their numbers."""
-    for outcome, time_limit, memory_limit, count in about["outcomes"]:
-        yield {"outcome": outcome, "time_limit": time_limit, "memory_limit": memory_limit}, count
+def _read_mark(path: Path) -> str:
+    """Return the metadata of a Parquet file; empty if it is missing or damaged."""
+    try:
+        with load_pyarrow().ParquetFile(path) as parquet:
+            return (parquet.schema_arrow.metadata or {}).get(_MARK, b"").decode()
+    except (OSError, ValueError):
+        return ""
 
 
 def write_results(path: Path, about: dict[str, Any], found: Iterable[Result], form: str) -> None:
@@ -117,11 +84,11 @@ def write_results(path: Path, about: dict[str, Any], found: Iterable[Result], fo
 def _write_tar(file: BinaryIO, about: str, found: Iterable[Result]) -> None:
     file.write(pack_comment(about))
     for result in found:
-        file.write(_pack_result(*result))
+        file.write(pack_result(*result))
     file.write(END_MARK)
 
 
-def _pack_result(key: str, record: Record, data: bytes | None, form: str) -> bytes:
+def pack_result(key: str, record: Record, data: bytes | None, form: str) -> bytes:
     """Return the members of a result in a tar file: the map, if there is one, and the record after it."""
     packed = b"" if data is None else pack_member(f"{key}.{form}", data)
     return packed + pack_member(key + _RECORD, json.dumps(record, allow_nan=False).encode() + b"\n")
@@ -224,87 +191,3 @@ def _parquet_results(path: Path, maps: bool) -> Iterator[Result]:
             for row in rows.to_pylist():
                 key, data = row.pop(KEYS[0]), row.pop(form, None)
                 yield Result(key, {name: value for name, value in row.items() if value is not None}, data, form)
-
-
-class _Entry(NamedTuple):
-    start: int
-    end: int
-    record: Record  # The values `_KEPT`
-
-
-class Journal:
-    """Tar file to which results are appended, and which a killed process leaves behind.
-
-    When the journal is opened, any bytes after the last complete result are cut off.
-
-    Parameters
-    ----------
-    path : Path
-        The finished archive; the journal has the same name with the suffix ``.part``. A finished archive without a
-        journal becomes the journal.
-
-    Attributes
-    ----------
-    entries : dict of str to _Entry
-        The newest result of each problem.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.part = path.with_name(path.name + PART)
-        self.entries: dict[str, _Entry] = {}
-        with writing(self.part):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if not self.part.exists() and path.exists():
-                if not is_parquet(path):
-                    os.replace(path, self.part)
-                else:
-                    for result in read_results(path):
-                        self.add(result)
-            self._repair()
-
-    def record(self, key: str) -> Record | None:
-        """Return the kept values of the newest record of a problem; None if there is none."""
-        entry = self.entries.get(key)
-        return None if entry is None else entry.record
-
-    def add(self, result: Result) -> None:
-        """Append a result; OutputError if it cannot be written."""
-        packed = _pack_result(*result)
-        with writing(self.part), open(self.part, "ab") as file:
-            start = file.tell()
-            file.write(packed)
-        self._note(result.key, start, start + len(packed), result.record)
-
-    def finish(self, order: Sequence[str], stamp: str, settings: str, form: str) -> None:
-        """Write the finished archive with maps of a format, in the given order of names, and delete the journal."""
-        entries = [self.entries[key] for key in order]
-        about = describe((entry.record for entry in entries), stamp, settings)
-        with writing(self.path):
-            # An archive without problems has no journal.
-            with open(self.part, "a+b") as file:
-                write_results(self.path, about, _read_entries(file, entries), form)
-            self.part.unlink()
-
-    def _note(self, key: str, start: int, end: int, record: Record) -> None:
-        self.entries[key] = _Entry(start, end, {name: record[name] for name in _KEPT if name in record})
-
-    def _repair(self) -> None:
-        """Read the journal and cut off the bytes after the last complete result."""
-        if not self.part.exists():
-            return
-        with open(self.part, "r+b") as file:
-            end = 0
-            for one in read_tar_results(file, maps=False):
-                if one.result is None:
-                    break
-                self._note(one.result.key, one.start, one.end, one.result.record)
-                end = one.end
-            file.truncate(end)
-
-
-def _read_entries(file: BinaryIO, entries: Iterable[_Entry]) -> Iterator[Result]:
-    for entry in entries:
-        file.seek(entry.start)
-        packed = io.BytesIO(file.read(entry.end - entry.start))
-        yield from (one.result for one in read_tar_results(packed) if one.result is not None)

@@ -12,8 +12,8 @@ from typing import Any
 
 from quasiharmonic.io import suffixes
 from quasiharmonic.io.mesh_files import INPUTS
-from quasiharmonic.ui.batch.archives.tar_stream import Damage, open_tar, read_members
 from quasiharmonic.ui.batch.records import load_pyarrow
+from quasiharmonic.ui.batch.tar_stream import Damage, open_tar, read_members
 from quasiharmonic.util.untrusted import MAX_BYTES
 
 #: Suffixes of archives.
@@ -62,6 +62,19 @@ def is_archive(name: str) -> bool:
     return name.lower().endswith((*TAR, PARQUET))
 
 
+def is_parquet(path: str | os.PathLike[str]) -> bool:
+    """Whether a path or URL is that of a Parquet file."""
+    return os.fspath(path).lower().endswith(PARQUET)
+
+
+def results_name(name: str) -> str:
+    """Return the name of the results of an archive: results are not compressed."""
+    for suffix in (".tar.gz", ".tgz"):
+        if name.lower().endswith(suffix):
+            return name[: -len(suffix)] + ".tar"
+    return name
+
+
 def read_samples(path: Path, limit: int | None = None) -> Iterator[Sample]:
     """Read the problems of an archive, in order; constant memory. Members of a tar file have at most ``limit`` bytes.
 
@@ -75,9 +88,7 @@ def read_samples(path: Path, limit: int | None = None) -> Iterator[Sample]:
         A problem that cannot be read has an ``error``. OSError if the archive cannot be opened.
     """
     seen: set[str] = set()
-    for sample in (
-        _parquet_samples(path) if path.name.lower().endswith(PARQUET) else _tar_samples(path, limit or MAX_BYTES)
-    ):
+    for sample in _parquet_samples(path) if is_parquet(path) else _tar_samples(path, limit or MAX_BYTES):
         if sample.error is None:
             _check(sample, seen)
         seen.add(sample.key)
@@ -86,6 +97,10 @@ def read_samples(path: Path, limit: int | None = None) -> Iterator[Sample]:
 
 def _check(sample: Sample, seen: set[str]) -> None:
     """Set the error of a sample that cannot be used."""
+    first, second = (name.partition(".")[2] for name in INPUTS)
+    if first in sample.files:
+        # As in a folder.
+        sample.files.pop(second, None)
     meshes = [extension for extension in sample.files if _is_mesh(extension)]
     if sample.key in seen:
         sample.key, sample.error = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -71,7 +72,11 @@ def send(path: Path, location: str) -> None:
 
 
 def read_start(location: str, size: int) -> bytes | None:
-    """Return the first bytes of an object by URL; None if there is none."""
+    """Return the first bytes of a file; None if there is none."""
+    if not is_url(location):
+        with suppress(OSError), open(location, "rb") as file:
+            return file.read(size)
+        return None
     try:
         system, path = _open(location)
         return _retry(lambda: system.cat_file(path, start=0, end=size), location)
