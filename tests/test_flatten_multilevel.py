@@ -11,8 +11,13 @@ from quasiharmonic import Status, certify, distortion, find_cuts, flatten, is_in
 from quasiharmonic.apps.flattening import free_boundary, piece
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.disk_start import map_to_disk
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse, smooth_map, thick_energy
-from quasiharmonic.apps.flattening.multilevel.hierarchy import Hierarchy
+from quasiharmonic.apps.flattening.multilevel.coarse_flattening import (
+    descend_level,
+    flatten_coarse,
+    smooth_map,
+    thick_energy,
+)
+from quasiharmonic.apps.flattening.multilevel.hierarchy import Hierarchy, Level
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
@@ -83,6 +88,37 @@ def test_a_guarded_prolongation_stays_bijective(surface):
     w[level.vertices] = in_units(map_to_disk(V[level.vertices], level.F, level.loops), 0)
     fine = hierarchy.prolong(w, stop, 0, np.ones(len(V), dtype=bool), 1e-9)
     assert certify(F, fine.view(np.float64).reshape(-1, 2)).bijective
+
+
+def test_prolonging_again_places_the_vertices_that_change(surface):
+    V, F, loops = surface
+    hierarchy = Hierarchy(V, F, loops, 60)
+    stop = hierarchy.stops[-1]
+    level = hierarchy.level(stop)
+    w = np.zeros(len(V), dtype=np.complex128)
+    w[level.vertices] = in_units(map_to_disk(V[level.vertices], level.F, level.loops), 0)
+    marked = np.zeros(len(V), dtype=bool)
+    before = hierarchy.prolong(w, stop, 0, marked, 0.3)
+    marked[np.concatenate(loops)[::3]] = True
+    again = hierarchy.prolong(w, stop, 0, marked, 0.1, before)
+    assert (again != before).any()
+    np.testing.assert_allclose(again, hierarchy.prolong(w, stop, 0, marked, 0.1), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+def test_finer_levels_of_an_isometric_map_that_overlaps_are_free_again(guarded):
+    square, F = grid(120, 8)
+
+    def ring(turn):
+        angle, r = turn * square[:, 0], 1.5 - 0.5 * square[:, 1]
+        return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
+
+    # The ring turns by more than a full turn, so its isometric map overlaps itself.
+    V, loops = np.column_stack([ring(7), 0.02 * square[:, 0]]), boundary_loops(F, len(square))
+    level = Level(0, np.arange(len(V)), F, loops)
+    uv, needs_guard = descend_level(V, level, ring(6.1), "auto", guarded, 100)
+    assert certify(F, uv, loops=loops).bijective
+    assert needs_guard is guarded
 
 
 def test_affine_maps_are_prolonged_exactly():

@@ -73,6 +73,20 @@ def test_conjugate_gradients(steps, enough):
     load = np.random.default_rng(0).normal(size=(system.free.size, 2)) @ [1, 1j]
     system.factor()
     exact = system.solve(load)
-    found, converged = system.iterate(load, system.solve_diagonal, steps, 1e-14)
+    found, converged = system.iterate(load, system.solve_diagonal, steps, residual=1e-14)
     assert converged is enough
     assert np.allclose(found, exact, rtol=1e-5, atol=1e-6 * np.abs(exact).max()) is enough
+
+
+def test_conjugate_gradients_end_where_little_is_left():
+    V, F = grid(8, 8)
+    energy = DeformationEnergy(V, F, SymmetricDirichlet())
+    system = NewtonSystem(F, energy.g, len(V), np.array([0, 5]))
+    system.assemble(energy.curvature_of(energy.deform(V[:, 0] + 1j * V[:, 1])))
+    load = np.ones(system.free.size, dtype=np.complex128)
+    left = float((load.real @ system.solve_diagonal(load).real) * 2)
+    at_once, converged = system.iterate(load, system.solve_diagonal, 5, residual=0, negligible=2 * left)
+    assert converged
+    assert not at_once.any()
+    _, converged = system.iterate(load, system.solve_diagonal, 5, residual=0, negligible=1e-3 * left)
+    assert not converged

@@ -174,29 +174,41 @@ class NewtonSystem:
         return None
 
     def iterate(
-        self, load: ComplexArray, precondition: Callable[[ComplexArray], ComplexArray], steps: int, residual: float
+        self,
+        load: ComplexArray,
+        precondition: Callable[[ComplexArray], ComplexArray],
+        steps: int,
+        *,
+        residual: float,
+        negligible: float = 0.0,
     ) -> tuple[ComplexArray, bool]:
         """Solve with the assembled matrix by at most ``steps`` preconditioned conjugate gradients.
 
         Return the displacements (n - k,) complex128, and whether the work that the remaining load could do is at most
-        ``residual`` times theirs.
+        ``residual`` times theirs, or at most ``negligible``.
         """
         from scipy.sparse import csr_array
 
         upper = csr_array((self._values, self._indices, self._indptr), shape=2 * (self._first.size,))
         lower, x, rest = upper.T, np.zeros(load.size, dtype=np.complex128), load.copy()
-        along, before, done = np.zeros_like(x), 1.0, 0.0
+        along, part, before, done = np.zeros_like(x), np.empty_like(x), 1.0, 0.0
+        flat, flat_part = along.view(np.float64), part.view(np.float64)
         for _ in range(steps):
             heartbeat()
             better = precondition(rest)
             gain = work(rest, better)
-            if gain <= residual * done:
+            if gain <= max(residual * done, negligible):
                 return x, True
-            along = better + gain / before * along
-            flat = along.view(np.float64)
-            image = (upper @ flat + lower @ flat - self.diagonal * flat).view(np.complex128)
+            along *= gain / before
+            along += better
+            product = upper @ flat
+            product += lower @ flat
+            product -= np.multiply(self.diagonal, flat, out=flat_part)
+            image = product.view(np.complex128)
             length = gain / work(along, image)
-            x, rest, before, done = x + length * along, rest - length * image, gain, done + length * gain
+            x += np.multiply(along, length, out=part)
+            rest -= np.multiply(image, length, out=part)
+            before, done = gain, done + length * gain
         return x, False
 
     def solve_diagonal(self, load: ComplexArray) -> ComplexArray:

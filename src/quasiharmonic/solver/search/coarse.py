@@ -20,7 +20,7 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert
 # Vertices of the coarse mesh, as a fraction of the fine mesh's.
 _SHARE = 1 / 8
 # Maximum number of vertices of the coarse mesh,
-_MAX_VERTICES = 1500
+_MAX_VERTICES = 1000
 # unless the fixed vertices, all of which are kept, require more. This many vertices per fixed vertex suffice to grade
 # the triangles from the boundary to the interior.
 _PER_FIXED = 3

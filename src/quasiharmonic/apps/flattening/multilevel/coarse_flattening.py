@@ -41,6 +41,8 @@ _MIN_WEIGHT = 0.02
 _BAD = 20.0
 # If their patches are too large, only triangles beyond this quantile of the density are bad.
 _WORST = 0.99
+# Below this mean energy a map has little distortion.
+_LITTLE = 1.0
 #: Number of vertices of the coarsest mesh.
 COARSEST = 150
 #: Minimum ratio between the vertex counts of successive meshes.
@@ -137,7 +139,7 @@ def flatten_coarse(
     """Flatten a coarse mesh, and prolong its map to the surface.
 
     ``V`` (n, 3) is of about unit size, and the surface is connected and has no handles. With ``guarded`` the boundary
-    is guarded against overlaps from the beginning, otherwise after the first overlap. Return a bijective map (n, 2)
+    is guarded against overlaps from the beginning, otherwise where it overlaps itself. Return a bijective map (n, 2)
     with moderate distortion, or None if rounding prevents one.
     """
     hierarchy = Hierarchy(V, F, list(loops), COARSEST)
@@ -178,12 +180,10 @@ def prolong_map(
     w[here.vertices] = in_units(uv, 0)
     rim = Rim(there.loops)
     kept_inside = np.zeros(w.size, dtype=bool)
+    fine: ComplexArray | None = None
     for height in _HEIGHTS:
-        uv = (
-            hierarchy.prolong(w, here.stop, there.stop, kept_inside, height)[there.vertices]
-            .view(np.float64)
-            .reshape(-1, 2)
-        )
+        fine = hierarchy.prolong(w, here.stop, there.stop, kept_inside, height, fine)
+        uv = to_points(fine[there.vertices])
         met = rim.meetings(uv)
         if not met.size and is_injective(there.F, uv):
             return smooth_map(hierarchy.V[there.vertices], there.F, there.loops, uv, linear_solver)
@@ -196,12 +196,16 @@ def prolong_map(
 def descend_level(
     V: FloatArray, level: Level, uv: FloatArray, linear_solver: str, guarded: bool, steps: int
 ) -> tuple[FloatArray, bool]:
-    """Lower the symmetric Dirichlet energy of a level's bijective map; return it and whether a guard was needed."""
+    """Lower the symmetric Dirichlet energy of a level's bijective map, if ``guarded`` with a guard from the beginning.
+
+    Return the map, and whether finer levels need a guard from the beginning: where a map with little distortion
+    overlaps itself, only the coarse boundary does so.
+    """
     rim = Rim(level.loops)
     energy = thick_energy(V, level.F)
 
     def lower(rim: Rim | None) -> FloatArray:
-        descent = SurfaceDescent(energy, uv, linear_solver, rim=rim)
+        descent = SurfaceDescent(energy, uv, linear_solver, rim=rim, iterate=True)
         for _ in islice(descend(descent, SymmetricDirichlet(), _TOLERANCE), steps):
             pass
         return descent.uv
@@ -211,5 +215,6 @@ def descend_level(
         apart = rim.pull_apart(level.F, free) if rim.meets_itself(free) else free
         if apart is not None:
             return apart, False
+        guarded = energy.value(in_units(free, 0)) > _LITTLE
     energy.energy = SymmetricDirichlet()
-    return lower(rim), True
+    return lower(rim), guarded

@@ -57,8 +57,9 @@ class Hierarchy:
     def __init__(self, V: FloatArray, F: IntArray, loops: list[IntArray], goal: int) -> None:
         self.V = V
         self._n = n = len(V)
+        self._n_filled = n + len(loops)
         filled = make_fans(loops, n)
-        held = np.zeros(n + len(loops), dtype=bool)
+        held = np.zeros(self._n_filled, dtype=bool)
         held[n:] = True
         self._coarsening = coarsen(np.concatenate([F, filled]), held.size, held, goal + len(loops))
         self._rounds = len(self._coarsening.rounds)
@@ -101,22 +102,42 @@ class Hierarchy:
         F = number[T]
         return Level(stop, vertices, F, boundary_loops(F, vertices.size))
 
-    def prolong(self, w: ComplexArray, start: int, stop: int, kept_inside: BoolArray, height: float) -> ComplexArray:
+    def prolong(
+        self,
+        w: ComplexArray,
+        start: int,
+        stop: int,
+        kept_inside: BoolArray,
+        height: float,
+        before: ComplexArray | None = None,
+    ) -> ComplexArray:
         """Prolong a map ``w`` (n,) from the mesh at one stop to a finer one, ``stop < start``.
 
         ``w`` has the finest mesh's numbering. ``kept_inside`` (n,) marks boundary vertices that are placed inside the
         coarse image, so that their edges do not intersect others. The surface's shape places the other vertices. Such
         vertices that cannot be placed inside rise above their edges by ``height`` times the edge's length. If all
         boundary vertices are marked and the height is small enough, a bijective map stays bijective.
+
+        ``before`` is the result for the same ``w`` with fewer vertices marked and any height. Only vertices whose
+        positions may differ from it are placed again.
         """
-        w = w.copy()
+        w = (w if before is None else before).copy()
+        # Vertices, and hubs behind them, at which the map differs from the one before.
+        moved = np.zeros(self._n_filled, dtype=bool)
+        moved[: self._n] = kept_inside
         for number in reversed(range(stop, start)):
             for vertices, rings in self._coarsening.rounds[number]:
                 at_rim = (rings >= self._n).any(axis=1)
+                again = None if before is None else moved[vertices] | moved[rings].any(axis=1)
                 for some, rim in ((~at_rim, False), (at_rim, True)):
+                    if again is not None:
+                        some &= again
                     if some.any():
                         ring = self._open_rings(rings[some]) if rim else rings[some]
-                        w[vertices[some]] = self._place(w, vertices[some], ring, rim, kept_inside, height)
+                        placed = vertices[some]
+                        position = self._place(w, placed, ring, rim, kept_inside, height)
+                        moved[placed] = position != w[placed]
+                        w[placed] = position
         return w
 
     def _open_rings(self, rings: IntArray) -> IntArray:
