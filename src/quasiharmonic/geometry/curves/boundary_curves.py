@@ -25,9 +25,6 @@ from quasiharmonic.util.arrays import (
     vertex_names,
 )
 
-# Relative to the largest coordinate: a vertex this close to its position on the curve is not moved.
-_SAME_POSITION = 2.0**-51
-
 
 def check_corner_angle(angle: float) -> None:
     """Raise a ValueError unless the turning angle of corners is from 0 to 180 degrees."""
@@ -311,7 +308,9 @@ class Track:
 
 def _move_vertices(positions: FloatArray, vertices: IntArray, there: FloatArray) -> None:
     """Move vertices to their positions, except those that are there up to rounding."""
-    off = np.abs(positions[vertices] - there) > _SAME_POSITION * np.abs(there).max(initial=0)
+    # Relative to the largest coordinate: a vertex this close to its position on the curve is not moved.
+    same_position = 2.0**-51
+    off = np.abs(positions[vertices] - there) > same_position * np.abs(there).max(initial=0)
     is_moved = off.any(axis=1)
     positions[vertices[is_moved]] = there[is_moved]
 

@@ -28,11 +28,6 @@ from quasiharmonic.geometry.mesh.polygons import triangulate
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges, label_components, pair_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, mark, to_integers
 
-# Bound with a margin on the rounding of an orientation, relative to the sum of the magnitudes of its terms.
-_ORIENTATION_BOUND = 4e-16
-# The same for an in-circle determinant.
-_CIRCLE_BOUND = 2e-15
-
 
 class BlockedError(ValueError):
     """A segment passes through the point ``point``, which is not one of its ends."""
@@ -295,15 +290,19 @@ class Triangulation:
 
     def _turn(self, a: int, b: int, c: int) -> float:
         """A number with the exact sign of the orientation of three points."""
+        # Bound with a margin on the rounding of an orientation, relative to the sum of the magnitudes of its terms.
+        bound = 4e-16
         x, y = self._x, self._y
         left = (x[a] - x[c]) * (y[b] - y[c])
         right = (y[a] - y[c]) * (x[b] - x[c])
-        if abs(left - right) > _ORIENTATION_BOUND * (abs(left) + abs(right)) + 1e-300:
+        if abs(left - right) > bound * (abs(left) + abs(right)) + 1e-300:
             return left - right
         return float(orientation(self._array[a], self._array[b], self._array[c]))
 
     def _in_circle(self, p: int, q: int) -> bool:
         """Whether the point across an edge is certainly inside the circumcircle of the triangle to the edge's left."""
+        # The same for an in-circle determinant.
+        bound = 2e-15
         x, y = self._x, self._y
         a, d = self._apex[p, q], self._apex[q, p]
         px, py, qx, qy, ax, ay = x[p] - x[d], y[p] - y[d], x[q] - x[d], y[q] - y[d], x[a] - x[d], y[a] - y[d]
@@ -312,7 +311,7 @@ class Triangulation:
         size = (
             pp * (abs(qx * ay) + abs(qy * ax)) + qq * (abs(ax * py) + abs(ay * px)) + aa * (abs(px * qy) + abs(py * qx))
         )
-        return det > _CIRCLE_BOUND * size
+        return det > bound * size
 
 
 def _snake_order(points: FloatArray) -> IntArray:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,14 +28,22 @@ from quasiharmonic.solver.methods.base import Steps
 from quasiharmonic.solver.search.harmonised import Harmonised
 from quasiharmonic.util.arrays import FloatArray
 
-# Fraction of a round's evaluations for VectorAdam.
-_PROBING = 0.4
-# Its step length, halved when a step leaves the energy's domain.
-_LENGTH = 0.1
-# Decay rate of its mean squares.
-_MEMORY = 0.9
-# Smallest stiffness of a triangle, as a fraction of the mean stiffness.
-_SOFTEST = 1e-3
+
+class HarmonicDescentTuning(NamedTuple):
+    """Numbers that tune the descent to a harmonic map."""
+
+    # Fraction of a round's evaluations for VectorAdam.
+    probing: float = 0.4
+    # Its step length, halved when a step leaves the energy's domain.
+    length: float = 0.1
+    # Decay rate of its mean squares.
+    memory: float = 0.9
+    # Smallest stiffness of a triangle, as a fraction of the mean stiffness.
+    softest: float = 1e-3
+
+
+_TUNING = HarmonicDescentTuning()
+
 # Newton steps, and local repairs, for the last inverted triangles.
 UNTANGLING_STEPS = 40
 
@@ -96,7 +105,7 @@ class HarmonicDescent:
             if not np.isfinite(self._squares).all():
                 return False  # non-finite gradients give no units for L-BFGS
             stiffness = np.sqrt(self._squares)
-            stiffness += _SOFTEST * stiffness.mean()
+            stiffness += _TUNING.softest * stiffness.mean()
             self._last = lowest
             if left < 1:
                 return False
@@ -151,8 +160,8 @@ class HarmonicDescent:
         Return the lowest iterate and the number of evaluations left.
         """
         lowest = here = start
-        count = left = int(np.ceil(_PROBING * iterations))
-        length = _LENGTH
+        count = left = int(np.ceil(_TUNING.probing * iterations))
+        length = _TUNING.length
         while left > 0:
             for at in VectorAdam(iterations=left, schedule=((0, length),)).iterates(objective, here):
                 left -= 1
@@ -160,8 +169,8 @@ class HarmonicDescent:
                     length *= 0.5
                     break
                 gradient = at.gradient
-                self._squares *= _MEMORY
-                self._squares += (1 - _MEMORY) * (gradient.real**2 + gradient.imag**2)
+                self._squares *= _TUNING.memory
+                self._squares += (1 - _TUNING.memory) * (gradient.real**2 + gradient.imag**2)
                 here = at
                 self._visit(at)
                 if at.value < lowest.value:
