@@ -63,13 +63,12 @@ def find_places(ring: ComplexArray, position: ComplexArray) -> None:
     """Fill in the position (r,) of a vertex in each ring (r, d), the apex first."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for start in range(0, len(ring), _TUNING.rings_per_block):
-            block = ring[start : start + _TUNING.rings_per_block]
+            part = slice(start, start + _TUNING.rings_per_block)
+            block = ring[part]
             # Transpose to corner by corner, because rows are too short for fast NumPy operations. Use real numbers,
             # because products of complex numbers are not rounded the same way on all platforms.
             corners = np.ascontiguousarray(block.view(np.float64).reshape(*block.shape, 2).transpose(1, 2, 0))
-            position.view(np.float64).reshape(-1, 2)[start : start + _TUNING.rings_per_block] = _best_positions(
-                corners
-            ).T
+            position.view(np.float64).reshape(-1, 2)[part] = _best_positions(corners).T
 
 
 def _best_positions(ring: FloatArray) -> FloatArray:

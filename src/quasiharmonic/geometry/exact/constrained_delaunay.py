@@ -301,7 +301,7 @@ class Triangulation:
 
     def _in_circle(self, p: int, q: int) -> bool:
         """Whether the point across an edge is certainly inside the circumcircle of the triangle to the edge's left."""
-        # The same for an in-circle determinant.
+        # Bound with a margin on the rounding of the determinant, relative to the sum of the magnitudes of its terms.
         bound = 2e-15
         x, y = self._x, self._y
         a, d = self._apex[p, q], self._apex[q, p]

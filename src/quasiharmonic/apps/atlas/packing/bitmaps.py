@@ -9,8 +9,6 @@ import numpy as np
 from quasiharmonic.apps.atlas.packing.shapes import Shape
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, enumerate_each
 
-# Maximum distance between samples of an edge, in cells.
-_SPACING = 0.5
 # If the cells of two bitmaps with this radius plus half a distance are disjoint, the shapes are at least this distance
 # apart: the centre of some cell is within half a diagonal of the middle between the closest points.
 HALF_DIAGONAL = sqrt(0.5)
@@ -74,12 +72,14 @@ def _fill(tails: ComplexArray, heads: ComplexArray, h: int, w: int) -> BoolArray
 
 def _mark_near(cells: BoolArray, tails: ComplexArray, heads: ComplexArray, radius: float) -> None:
     """Mark the cells whose centres are within a distance of an edge."""
+    # Maximum distance between samples of an edge, in cells.
+    spacing = 0.5
     h, w = cells.shape
-    count = np.maximum(np.ceil(np.abs(heads - tails) / _SPACING), 1).astype(np.int64)
+    count = np.maximum(np.ceil(np.abs(heads - tails) / spacing), 1).astype(np.int64)
     edge, step = enumerate_each(count)
     samples = tails[edge] + (heads - tails)[edge] * (step / count[edge])
     # Every point of an edge is at most half the spacing from a sample.
-    reach = radius**2 + _SPACING**2 / 4
+    reach = radius**2 + spacing**2 / 4
     i, j = np.floor(samples.imag).astype(np.int64), np.floor(samples.real).astype(np.int64)
     y, x = samples.imag - i, samples.real - j
     k = int(sqrt(reach)) + 2

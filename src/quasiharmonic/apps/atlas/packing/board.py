@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,12 +14,20 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
 # Side, first row and first column.
 Window = tuple[int, int, int]
 
-# Largest side of the board of larger cells on which large bitmaps are placed.
-_COARSE = 256
-# Sides of windows. Windows overlap by half, so that a bitmap of almost half the side is in one window, wherever it is.
-_WINDOWS = 64, 128
-# A window without a free position is searched again for bitmaps with less than this share of the cells.
-_SMALLER = 0.8
+
+class BoardTuning(NamedTuple):
+    """Sizes of the boards and windows of the search."""
+
+    # Largest side of the board of larger cells on which large bitmaps are placed.
+    coarse: int = 256
+    # Sides of windows. Windows overlap by half, so that a bitmap of almost half the side is in one window, wherever it
+    # is.
+    windows: tuple[int, ...] = (64, 128)
+    # A window without a free position is searched again for bitmaps with less than this share of the cells.
+    smaller: float = 0.8
+
+
+_TUNING = BoardTuning()
 
 
 class Bitmaps:
@@ -58,9 +67,9 @@ class Board:
 
     def __init__(self, rows: int, columns: int, *, windows: bool) -> None:
         self.rows, self.columns = rows, columns
-        self._sizes = _WINDOWS if windows else ()
+        self._sizes = _TUNING.windows if windows else ()
         # Cells outside the board count as occupied.
-        outside = _WINDOWS[-1] if windows else 1
+        outside = _TUNING.windows[-1] if windows else 1
         self._cells = np.ones((rows + 1 + outside, columns + 1 + outside), dtype=bool)
         self._cells[1 : rows + 1, 1 : columns + 1] = False
         self._failed: dict[Window, int] = {}
@@ -91,12 +100,12 @@ class Board:
                 found = find_most_contact(self._cells[first : first + size, left : left + size], bitmaps.runs)
                 if found is not None:
                     return Spot(found.direction, first + found.row - 1, left + found.column - 1)
-                self._failed[window] = int(_SMALLER * bitmaps.count)
+                self._failed[window] = int(_TUNING.smaller * bitmaps.count)
         return None
 
     def _find_coarsely(self, bitmaps: Bitmaps) -> Spot | None:
         """Find a position on a board of larger cells, each of several cells."""
-        step = ceil((max(self.rows, self.columns) + 2) / _COARSE) + 1
+        step = ceil((max(self.rows, self.columns) + 2) / _TUNING.coarse) + 1
         h, w = (ceil(n / step) for n in self._cells.shape)
         padded = np.ones((h * step, w * step), dtype=bool)
         padded[: self._cells.shape[0] - 1, : self._cells.shape[1] - 1] = self._cells[1:, 1:]

@@ -13,8 +13,6 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, to_com
 
 # Largest distance between vertices of congruent charts, relative to the chart's radius.
 _TOLERANCE = 1e-4
-# Vertices of a chart compared with the most distant vertex of another.
-_MOST_ANCHORS = 64
 
 
 class Motion(NamedTuple):
@@ -72,12 +70,14 @@ def _align(
     z: ComplexArray, F: IntArray, goal: ComplexArray, goal_F: IntArray, tree: KDTree
 ) -> tuple[Motion, float] | None:
     """Motion of vertices with mean zero onto those of another chart, if the charts are congruent."""
+    # Vertices of a chart compared with the most distant vertex of another.
+    most_anchors = 64
     radius = float(np.abs(goal).max())
     tolerance = _TOLERANCE * radius
     if abs(float(np.abs(z).max()) - radius) > tolerance:
         return None
     anchor = goal[np.argmax(np.abs(goal))]
-    near = np.flatnonzero(np.abs(np.abs(z) - radius) <= tolerance)[:_MOST_ANCHORS]
+    near = np.flatnonzero(np.abs(np.abs(z) - radius) <= tolerance)[:most_anchors]
     for mirrored in (False, True):
         for vertex in near.tolist():
             start = Motion(mirrored, 1, 0).move(z)

@@ -34,9 +34,6 @@ from quasiharmonic.util.arrays import (
     triangle_array,
 )
 
-# Additional space between charts, relative to the texture's side, for rounding to single precision.
-_ROUNDING = 2.0**-22
-
 
 @dataclass(frozen=True)
 class Placement:
@@ -133,6 +130,8 @@ def pack_charts(
     ValueError
         If arguments are malformed, or the charts do not fit. The message then names a sufficient resolution.
     """
+    # Additional space between charts, relative to the texture's side, for rounding to single precision.
+    rounding = 2.0**-22
     pairs = _check_charts(charts)
     size = check_texture(resolution, padding, texels_per_unit, tiles, rotate, stack)
     if kinds is not None and len(kinds) != len(pairs):
@@ -151,7 +150,7 @@ def pack_charts(
     shapes = [make_shape(*pairs[i]) for i in originals]
     # Coordinates of later tiles are larger, and so are their rounding errors.
     reach = max(min(tiles, 10), -(-tiles // 10))
-    spaced = padding + max(size) * (_ROUNDING * 2.0 ** (reach - 1).bit_length() + _deviation(pairs, copies))
+    spaced = padding + max(size) * (rounding * 2.0 ** (reach - 1).bit_length() + _deviation(pairs, copies))
     if wanted is not None and wanted < least_scale(shapes):
         raise ValueError(
             f"with {texels_per_unit:g} texels per unit, all charts are smaller than a texel: use more texels per unit"

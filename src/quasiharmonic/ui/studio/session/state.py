@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,11 +21,18 @@ from quasiharmonic.ui.studio.session.recipes import Recipe
 from quasiharmonic.ui.studio.session.surface import PageSurface
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-#: Maximum numbers of obstructions and of elements per obstruction that are sent to the page.
-_MAX_OBSTRUCTIONS = 20
-_MAX_ELEMENTS = 2000
-# Islands above this number are not checked for overlaps with each other after each change.
-_MAX_CHECKED = 2000
+
+class StateLimits(NamedTuple):
+    """Limits of the state that is sent to the page."""
+
+    # Maximum numbers of obstructions and of elements per obstruction.
+    obstructions: int = 20
+    elements: int = 2000
+    # Islands above this number are not checked for overlaps with each other after each change.
+    checked: int = 2000
+
+
+_LIMITS = StateLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +76,7 @@ class SessionState:
     @cached_property
     def overlapping(self) -> IntArray:
         """Pairs (p, 2) of islands that share points of the plane."""
-        if not self.mapped or len(self.islands) == 1 or len(self.islands) > _MAX_CHECKED:
+        if not self.mapped or len(self.islands) == 1 or len(self.islands) > _LIMITS.checked:
             return np.empty((0, 2), dtype=np.int64)
         return certify_islands(self.mesh).overlapping
 
@@ -212,14 +219,14 @@ def describe_obstructions(state: SessionState) -> list[dict[str, Any]]:
                     "message": each.message,
                     "advice": each.advice,
                     "forbids": each.forbids.value,
-                    "vertices": (each.vertices + start).tolist()[:_MAX_ELEMENTS],
-                    "edges": (edges.reshape(-1, 2) + start).tolist()[:_MAX_ELEMENTS],
-                    "triangles": (each.triangles + first).tolist()[:_MAX_ELEMENTS],
+                    "vertices": (each.vertices + start).tolist()[: _LIMITS.elements],
+                    "edges": (edges.reshape(-1, 2) + start).tolist()[: _LIMITS.elements],
+                    "triangles": (each.triangles + first).tolist()[: _LIMITS.elements],
                 }
             )
     if found and state.recipe.dragged:
         return [_describe_drag(found)]
-    return found[:_MAX_OBSTRUCTIONS]
+    return found[: _LIMITS.obstructions]
 
 
 def _describe_drag(found: list[dict[str, Any]]) -> dict[str, Any]:
