@@ -7,9 +7,8 @@ fold.
 
 A patch around an inverted triangle is therefore restarted many times. One kind of start is a quasi-harmonic map of
 random tensors. Another moves a vertex of that triangle into its intersection and fixes it while the other vertices
-make space. If a chain of vertices must go around the fold, the inverted triangles get more weight
-(`quasiharmonic.solver.methods.reweighting`). A patch is accepted if it does not increase the number of inverted
-triangles, so the map may drift until all triangles fit.
+make space. If a chain of vertices must go around the fold, the inverted triangles get more weight (`reweight`). A patch
+is accepted if it does not increase the number of inverted triangles, so the map may drift until all triangles fit.
 """
 
 from __future__ import annotations
@@ -38,7 +37,6 @@ from quasiharmonic.solver.methods.local_repair import (
     remap_patches,
     untangle_fully,
 )
-from quasiharmonic.solver.methods.reweighting import reweight
 from quasiharmonic.solver.methods.untangling import GRADINGS, untangle
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, check_integer, mark, to_points
 
@@ -200,3 +198,45 @@ def find_nearest(region: ComplexArray, point: complex) -> complex:
     share, distance = nearest_on_segments(to_points(np.array([point])), to_points(region), to_points(ahead))
     k = int(np.argmin(distance))
     return complex(region[k] + share[k] * (ahead[k] - region[k]))
+
+
+class ReweightingTuning(NamedTuple):
+    """Numbers that tune the rounds of reweighting."""
+
+    # Possible factors of an inverted triangle's weight per round; one is drawn for all rounds.
+    factors: tuple[float, ...] = (3.0, 10.0)
+    # Maximum number of rounds.
+    rounds: int = 15
+    # If a map has this many more inverted triangles than the first, it does not recover, and the rounds end.
+    max_extra: int = 15
+
+
+_REWEIGHTING = ReweightingTuning()
+
+
+def reweight(
+    rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str, effort: RepairEffort | None = None
+) -> ComplexArray:
+    """Return another map of a patch, found by weighting its inverted triangles.
+
+    Untangling starts with a large ε, for which its energy has hardly more than one minimum. From any start a patch
+    therefore ends in one of the same few maps, and another result needs another energy. Triangles that stay inverted
+    get more weight in every round, as constraints do in searches for satisfying assignments. They are untangled at the
+    expense of others, which gain weight in turn, until all triangles fit.
+
+    It is the first map without inverted triangles, or else the last one with no more of them than ``w`` (v,). ``rng``
+    draws the factor and the grading of every round.
+    """
+    factor = float(rng.choice(_REWEIGHTING.factors))
+    weights = np.ones(len(patch.F))
+    inverted = signed_areas(patch.F, w) <= 0
+    first, last = inverted.sum(), w
+    for _ in range(_REWEIGHTING.rounds):
+        weights[inverted] *= factor
+        w = untangle_fully(patch, w, patch.fixed, float(rng.choice(GRADINGS)), linear_solver, weights, effort)
+        inverted = signed_areas(patch.F, w) <= 0
+        if inverted.sum() <= first:
+            last = w
+        if not inverted.any() or inverted.sum() > first + _REWEIGHTING.max_extra:
+            break
+    return last

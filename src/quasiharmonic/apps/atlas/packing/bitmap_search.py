@@ -8,9 +8,7 @@ from math import ceil, pi, sqrt
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.packing.bitmaps import HALF_DIAGONAL, draw, draw_in_place
-from quasiharmonic.apps.atlas.packing.board import Bitmaps, Board
-from quasiharmonic.apps.atlas.packing.contact import Spot
+from quasiharmonic.apps.atlas.packing.board import HALF_DIAGONAL, Bitmaps, Board, Spot, draw, draw_in_place
 from quasiharmonic.apps.atlas.packing.shapes import Shape
 from quasiharmonic.util.arrays import ComplexArray, IntArray
 from quasiharmonic.util.progress import heartbeat
