@@ -42,7 +42,7 @@ def objective_of(V, F, uv, fixed, energy, *, eta=0.3, conformal=0.2, weights=Non
     area = float(signed_areas(F, problem.frame.inward(uv)).sum())
     deformation = None if energy is None else DeformationEnergy(V, F, energy, area=area, weights=weights)
     regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
-    return objective.descending(
+    return objective.with_functional(
         Harmonised(problem, objective.mesh, area, deformation, regulariser, eta=eta, conformal=conformal)
     )
 

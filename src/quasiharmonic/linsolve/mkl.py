@@ -82,7 +82,7 @@ class MKL(LinearSolver):
     requirement = "pip install mkl (x86-64 Linux and Windows)"
 
     @classmethod
-    def present(cls) -> bool:
+    def is_installed(cls) -> bool:
         """Whether MKL's runtime library is found."""
         return find_mkl() is not None
 

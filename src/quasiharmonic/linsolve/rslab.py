@@ -119,7 +119,7 @@ class Rslab(LinearSolver):
         If that fails too, rslab's factor is kept, so that later solves fail in the same way.
         """
         if self._fallback is None:
-            other = Qdldl if Qdldl.present() else SuperLU
+            other = Qdldl if Qdldl.is_installed() else SuperLU
             self._fallback = other(self._indptr, self._indices)
         self._fallback.factor(self._values)
         self._numeric = None

@@ -146,12 +146,12 @@ def _mean_deviation(
     local = (points[:, 1:-1] - points[:, :1]) / side[:, None]
     distance = local.imag * np.abs(side)[:, None]
 
-    def across(vectors: NDArray[np.complex128]) -> FloatArray:
+    def measure_across(vectors: NDArray[np.complex128]) -> FloatArray:
         return np.asarray((vectors * normal.conj()[:, None]).real)
 
-    inner = across(tangents[:, 1:-1])
-    by_begin = (1 - _FRACTIONS) * inner - (1 - local.real) * across(tangents[:, :1])
-    by_end = _FRACTIONS * inner - local.real * across(tangents[:, -1:])
+    inner = measure_across(tangents[:, 1:-1])
+    by_begin = (1 - _FRACTIONS) * inner - (1 - local.real) * measure_across(tangents[:, :1])
+    by_end = _FRACTIONS * inner - local.real * measure_across(tangents[:, -1:])
     by_ends = np.stack([by_begin, by_end], axis=1)
     count = _FRACTIONS.size
     return (

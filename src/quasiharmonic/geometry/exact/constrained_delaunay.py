@@ -192,7 +192,7 @@ class Triangulation:
         new_edges = []
         while crossing:
             p, q = crossing.popleft()
-            if not self._flippable(p, q):
+            if not self._can_flip(p, q):
                 crossing.append((p, q))
                 continue
             left, right = self._flip(p, q)
@@ -266,11 +266,11 @@ class Triangulation:
             p, q = waiting.pop()
             if (p, q) not in self._apex or (q, p) not in self._apex or (p, q) in self._required:
                 continue
-            if self._in_circle(p, q) and self._flippable(p, q):
+            if self._in_circle(p, q) and self._can_flip(p, q):
                 left, right = self._flip(p, q)
                 waiting += [(p, right), (right, q), (q, left), (left, p)]
 
-    def _flippable(self, p: int, q: int) -> bool:
+    def _can_flip(self, p: int, q: int) -> bool:
         """Whether the two triangles at an edge form a strictly convex quadrilateral."""
         left, right = self._apex[p, q], self._apex[q, p]
         return self._turn(left, right, q) > 0 and self._turn(right, left, p) > 0

@@ -202,7 +202,7 @@ class _GridLevel:
     triangle: IntArray  # (sum of lengths,): the lists, each ascending
     crowded: BoolArray  # (k,): whether a cell has all of the few triangles that the one had that it is a part of
 
-    def without(self, cells: IntArray) -> _GridLevel:
+    def empty_lists(self, cells: IntArray) -> _GridLevel:
         """Return the level with empty lists for the given cells."""
         kept = ~mark(self.length.size, cells)
         triangle = self.triangle[repeat_each(kept, self.length)]
@@ -249,7 +249,7 @@ class NestedGrid:
             if not split.size:
                 break
             parts[-1][split] = cell_count + 16 * np.arange(split.size)
-            levels[-1] = level.without(split)
+            levels[-1] = level.empty_lists(split)
             levels.append(finer)
             parts.append(np.full(finer.length.size, -1, dtype=np.int64))
             cell_count += finer.length.size

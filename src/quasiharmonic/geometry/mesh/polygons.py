@@ -275,7 +275,7 @@ class _Sweep:
         before, after = v - 1, (v + 1) % len(self._corners)
         here = self._corners[v]
         from_left, to_right = self._corners[before] < here, here < self._corners[after]
-        at = self._below(here)
+        at = self._find_below(here)
         interval = self._intervals[at] if at >= 0 else None
         if from_left and to_right:  # on the lower side of an interval
             assert interval is not None
@@ -347,7 +347,7 @@ class _Sweep:
         link.below, next_.above = next_, link
         interval.top = interval.last = link
 
-    def _below(self, point: Point) -> int:
+    def _find_below(self, point: Point) -> int:
         """Index of the highest interval whose lower side is below or at a point; -1 if there is no such interval."""
         low, high = 0, len(self._intervals)
         x, y = point

@@ -73,7 +73,7 @@ class Wedges:
             if part is not None:
                 yield k, part
 
-    def overlapping(self, other: Wedges) -> IntArray | None:
+    def find_overlapping(self, other: Wedges) -> IntArray | None:
         """Return pairs of wedges that may overlap, (m, 2) int64, or None if there are too many candidates."""
         self.effort.spend(300)
         rows = np.argwhere(self._rows_may_reach(other) & other._rows_may_reach(self).T)

@@ -132,7 +132,7 @@ def _area_middles(stars: Stars, fixture: Fixture, corners: Corners | None) -> Fl
     for k, (begin, end) in enumerate(pairwise([0, *ends.tolist()])):
         area = fixture.left_of(fixture.extent(), edge[begin:end])
         if area is not None:
-            positions[k] = fixture.lattice.middle(area)
+            positions[k] = fixture.lattice.find_middle(area)
     return positions
 
 

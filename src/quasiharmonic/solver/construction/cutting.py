@@ -121,7 +121,7 @@ def _find_path(sheet: Sheet, positions: list[complex], start: int, end: int, wei
     axis = chord / (abs(chord) or 1.0)
     size = max(abs(chord), _COSTS.shortest)
 
-    def where(node: Node) -> complex:
+    def locate(node: Node) -> complex:
         at = positions[node] if isinstance(node, int) else (positions[node[0]] + positions[node[1]]) / 2
         return (at - positions[start]) * axis.conjugate() / size
 
@@ -140,11 +140,11 @@ def _find_path(sheet: Sheet, positions: list[complex], start: int, end: int, wei
         if node == end:
             break
         done.add(node)
-        here = where(node)
+        here = locate(node)
         for other in _neighbours(sheet, node, start, end):
             if other in done:
                 continue
-            there = where(other)
+            there = locate(other)
             further = abs(there - here) * (1 + weight * (deviation(here) + deviation(there))) + _COSTS.step
             if not isinstance(other, int):
                 further += (

@@ -84,7 +84,7 @@ class Objective:
         """The functional of this problem."""
         return FUNCTIONALS[self._functional](self.problem, self.mesh)
 
-    def descending(self, functional: Functional) -> Objective:
+    def with_functional(self, functional: Functional) -> Objective:
         """Return a copy with another functional, which must belong to this problem and mesh."""
         other = copy(self)
         other.functional = functional
@@ -129,7 +129,7 @@ class Objective:
         quasiharmonic.linsolve.NotPositiveDefinite
             If the Laplacian is not positive definite after rounding.
         """
-        return self.evaluate(self.bounded(self.parameterisation.invert(self.own_tensor(w))))
+        return self.evaluate(self.clip_xi(self.parameterisation.invert(self.own_tensor(w))))
 
     def step(self, start: Iterate, step: ComplexArray) -> Iterate:
         """Evaluate at ``ξ + step`` with clipped tensors; halve the step while no factorisation exists.
@@ -141,12 +141,12 @@ class Objective:
         """
         for _ in range(10):
             try:
-                return self.evaluate(self.bounded(start.xi + step))
+                return self.evaluate(self.clip_xi(start.xi + step))
             except NotPositiveDefinite:
                 step = 0.5 * step
-        return self.evaluate(self.bounded(start.xi + step))
+        return self.evaluate(self.clip_xi(start.xi + step))
 
-    def bounded(self, xi: ComplexArray) -> ComplexArray:
+    def clip_xi(self, xi: ComplexArray) -> ComplexArray:
         """Clip the moduli of ``xi`` in place so that the rounded tensors are positive definite, and return ``xi``."""
         clip_moduli(xi, self.parameterisation.bound)
         return xi

@@ -73,18 +73,18 @@ class LBFGS(FunctionalDescent):
                 pairs.clear()
                 continue
 
-            def trial(
+            def evaluate_step(
                 t: float, bound: float, xi: ComplexArray = here.xi, along: ComplexArray = direction
             ) -> tuple[float, Iterate | None]:
                 nonlocal left
                 left -= 1
                 try:
-                    there = objective.evaluate(objective.bounded(xi + t * along))
+                    there = objective.evaluate(objective.clip_xi(xi + t * along))
                 except NotPositiveDefinite:
                     return np.inf, None
                 return there.value, there if there.value < bound else None
 
-            def shorter(t: float, after: float, before: float = before, slope: float = slope) -> float:
+            def choose_factor(t: float, after: float, before: float = before, slope: float = slope) -> float:
                 """Return the factor that leads to the minimum of the interpolating parabola, within 0.1 to 0.5."""
                 if not np.isfinite(after):
                     return 0.25
@@ -92,7 +92,9 @@ class LBFGS(FunctionalDescent):
 
             farthest = float((np.abs(direction) / (1 + np.abs(here.xi))).max())
             longest = min(1.0, (_TUNING.longest if pairs else _TUNING.first) / farthest)
-            taken = backtrack(trial, before, -slope, longest=longest, tries=min(_TUNING.tries, left), factor=shorter)
+            taken = backtrack(
+                evaluate_step, before, -slope, longest=longest, tries=min(_TUNING.tries, left), factor=choose_factor
+            )
             if taken is None:
                 if not pairs or left <= 0:
                     return left > 0

@@ -70,7 +70,7 @@ class Newton(TensorDescent):
                 # If all curvatures underflow, a division by zero gives NaN, and matrices with NaN are rejected.
                 with np.errstate(divide="ignore", invalid="ignore"):
                     step, predicted = model.step(system, damping)
-                there = objective.evaluate(objective.bounded(here.xi + step))
+                there = objective.evaluate(objective.clip_xi(here.xi + step))
             except NotPositiveDefinite:
                 predicted, there = 0.0, None
             gain = (here.dirichlet - there.dirichlet) / predicted if there is not None and predicted > 0 else -np.inf

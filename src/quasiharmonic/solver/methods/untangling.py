@@ -310,14 +310,14 @@ class RegularisedDescent:
         full[system.free] = direction
         start = self.w
 
-        def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
+        def evaluate_step(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
             w = start + t * full
             at = self._deformation_energy.deform(w)
             value = self._deformation_energy.value_of(at)
             return value, (w, at) if value < bound else None
 
-        taken = backtrack(trial, before, expected_decrease, tries=_TUNING.halvings)
+        taken = backtrack(evaluate_step, before, expected_decrease, tries=_TUNING.halvings)
         if taken is None:
             return None
-        _, after, (self.w, self._deformation) = extend(trial, taken)
+        _, after, (self.w, self._deformation) = extend(evaluate_step, taken)
         return after

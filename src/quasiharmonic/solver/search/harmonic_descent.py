@@ -108,7 +108,7 @@ class HarmonicDescent:
 
     def run(self, name: str, eta: float, iterations: int, tol: float) -> bool:
         """Run one round; return whether it converged."""
-        objective = self._objective.descending(self._energy(eta))
+        objective = self._objective.with_functional(self._energy(eta))
         with self._stage(name):
             start = self._restart(objective)
             self._measure.check_numbers(start)

@@ -67,9 +67,9 @@ def clear_chords(
     left = np.flatnonzero(bends > min_turn)
     found: list[tuple[int, float]] = []
     for stretch in stretches(s, pins):
-        here, wanted = stretch.within(t, sharp[bends[sharp] > 0])
-        spare = _find_between(wanted, stretch.within(t, sharp[bends[sharp] < 0])[1])
-        straight = _find_between(wanted, stretch.within(t, left)[1]) == 0
+        here, wanted = stretch.find_inside(t, sharp[bends[sharp] > 0])
+        spare = _find_between(wanted, stretch.find_inside(t, sharp[bends[sharp] < 0])[1])
+        straight = _find_between(wanted, stretch.find_inside(t, left)[1]) == 0
         conditions = ChordConditions(reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
         chosen = choose(stretch.along, wanted, conditions)
         if chosen is None:

@@ -109,7 +109,7 @@ class Studio:
             try:
                 await server.serve_forever()
             finally:
-                await asyncio.gather(*(page.ended() for page in list(self._pages)))
+                await asyncio.gather(*(page.wait_for_end() for page in list(self._pages)))
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuse a request, answer it with a file, or return None to open a socket."""
@@ -180,7 +180,7 @@ class Studio:
             await connection.close(1011, "the process has ended")
         finally:
             listening.cancel()
-            await page.ended()
+            await page.wait_for_end()
             self._pages.discard(page)
             if self._sessions.get(session, (None, None))[1] is page:
                 del self._sessions[session]
@@ -196,7 +196,7 @@ class Studio:
         if session in self._sessions:
             connection, page = self._sessions.pop(session)
             await connection.close(ELSEWHERE, "this session was opened in another tab")
-            await page.ended()
+            await page.wait_for_end()
 
     async def _listen(self, connection: ServerConnection, page: Page) -> None:
         """Forward the messages of the page to its process."""
@@ -321,7 +321,7 @@ class Page:
         with suppress(ProcessLookupError):
             self._process.kill()
 
-    async def ended(self) -> None:
+    async def wait_for_end(self) -> None:
         """Kill the process and wait for its end."""
         self.end()
         await self._process.wait()

@@ -327,7 +327,7 @@ class Numbering:
         k = int(np.searchsorted(self.starts, vertex, side="right")) - 1
         return k, vertex - int(self.starts[k])
 
-    def same(self, other: Numbering | None) -> bool:
+    def equals(self, other: Numbering | None) -> bool:
         """Return whether another numbering has the same vertices and triangles."""
         return (
             other is not None

@@ -72,7 +72,7 @@ class PageUpdates:
         """The image on the surface."""
         return self._history.texture
 
-    def _busy(self, what: str) -> None:
+    def _tell_busy(self, what: str) -> None:
         self._working, self._stopped = True, False
         self._tell({"kind": "busy", "what": what}, {})
 
@@ -105,7 +105,7 @@ class PageUpdates:
     def _show(self, *, fit: bool = False) -> None:
         """Send the current state to the page."""
         state, self._working = self.state, False
-        if not state.numbering.same(self._numbering):
+        if not state.numbering.equals(self._numbering):
             self._send_surface(state)
             fit = True
         if fit and state.mapped:
