@@ -40,6 +40,15 @@ ELSEWHERE = 4001
 _SESSION = re.compile(r"[0-9a-f]{32}")
 #: Close code of a socket if too many pages are open.
 TRY_LATER = 1013
+# Code of the worker process; -P prevents imports from the working directory.
+_CODE = "import sys; from quasiharmonic.ui.studio.server.page_worker import serve; serve(*sys.argv[1:])"
+#: Memory limit of one page, bytes.
+MAX_MEMORY = 6 << 30
+# Seconds between two checks, and seconds until a process must react to "stop".
+_CHECK_INTERVAL = 0.5
+_STOP_TIMEOUT = 15.0
+# Bytes written to a process at a time, to avoid a second copy of large messages.
+_WRITE_SIZE = 1 << 18
 # Load nothing from other sites, forbid framing, and never send the address with its token as a referrer.
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
@@ -235,17 +244,6 @@ def _answer(status: HTTPStatus, body: str | bytes, kind: str = "text/plain; char
     headers = Headers({**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content)), "Connection": "close"})
     headers.update({name.title(): value for name, value in further.items()})
     return Response(status.value, status.phrase, headers, content)
-
-
-# Code of the worker process; -P prevents imports from the working directory.
-_CODE = "import sys; from quasiharmonic.ui.studio.server.page_worker import serve; serve(*sys.argv[1:])"
-#: Memory limit of one page, bytes.
-MAX_MEMORY = 6 << 30
-# Seconds between two checks, and seconds until a process must react to "stop".
-_CHECK_INTERVAL = 0.5
-_STOP_TIMEOUT = 15.0
-# Bytes written to a process at a time, to avoid a second copy of large messages.
-_WRITE_SIZE = 1 << 18
 
 
 class Page:
