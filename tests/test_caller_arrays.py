@@ -126,8 +126,7 @@ KERNELS = {
     "geometry.mesh.topology": ["sort_edges", "number_sides", "link_nodes", "follow_loops"],
     "geometry.mesh.reference": ["lay_flat", "wirtinger"],
     "energies.deformation": ["jacobians", "pulls", "collapses"],
-    "linsolve.pattern": ["find_pattern"],
-    "linsolve.laplacian": ["assemble", "boundary_load", "put_at"],
+    "linsolve.laplacian": ["find_pattern", "assemble", "boundary_load", "put_at"],
     "geometry.exact.point_location": ["sure_hits", "find_cells", "divide_cells"],
 }
 

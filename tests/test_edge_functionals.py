@@ -10,8 +10,7 @@ from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
-from quasiharmonic.solver.field.objective import Objective
-from quasiharmonic.solver.field.passes import own_sweep
+from quasiharmonic.solver.field.objective import Objective, own_sweep
 from quasiharmonic.solver.methods import LBFGS, VectorAdam
 from quasiharmonic.surfaces import annulus, disk, random_delaunay
 from shared.functionals import MESHES, NAMES, SIGHTED, matrices, posed

@@ -182,7 +182,9 @@ def landmarks(**options):
 
 
 def test_a_warp_without_a_map_is_an_interrupt(monkeypatch):
-    monkeypatch.setattr("quasiharmonic.solver.search.record.StageRun.visit", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(
+        "quasiharmonic.solver.search.record.StageRun.record_iterate", Mock(side_effect=KeyboardInterrupt)
+    )
     with pytest.raises(KeyboardInterrupt):
         landmarks()
 

@@ -17,7 +17,7 @@ from quasiharmonic.energies.energies import MIPS
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from quasiharmonic.solver.field.objective import Objective
-from quasiharmonic.solver.search.harmonised import Conformal, Harmonised
+from quasiharmonic.solver.search.harmonic_descent import Conformal, Harmonised
 from shared.meshes import bend, lift, random_annulus, random_xi
 
 
@@ -34,7 +34,9 @@ def harmonised(problem):
     objective = Objective(problem, reference="rest")
     energy = DeformationEnergy(problem.V, problem.F, MIPS(), area=2.0)
     regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
-    return objective.descending(Harmonised(problem, objective.mesh, 2.0, energy, regulariser, eta=0.3, conformal=0.2))
+    return objective.with_functional(
+        Harmonised(problem, objective.mesh, 2.0, energy, regulariser, eta=0.3, conformal=0.2)
+    )
 
 
 MAKERS = {name: lambda problem, name=name: Objective(problem, name) for name in FUNCTIONALS} | {

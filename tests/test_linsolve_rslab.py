@@ -38,7 +38,7 @@ def test_unknown_name():
     ],
 )
 def test_a_backend_that_is_not_installed(monkeypatch, backend, command):
-    monkeypatch.setattr(backend, "present", classmethod(lambda cls: False))
+    monkeypatch.setattr(backend, "is_installed", classmethod(lambda cls: False))
     assert backend.name not in available()
     with pytest.raises(ImportError, match=f"'{backend.name}' is not installed; available: .*superlu.*: {command}"):
         make_solver([0, 1], [0], name=backend.name)
@@ -62,10 +62,10 @@ def test_auto_uses_the_first_backend_that_loads(monkeypatch):
 
 def test_preference_depends_on_the_number_of_entries(monkeypatch):
     for backend in (mkl.MKL, cholmod.Cholmod, rslab.Rslab, qdldl.Qdldl):
-        monkeypatch.setattr(backend, "present", classmethod(lambda cls: True))
+        monkeypatch.setattr(backend, "is_installed", classmethod(lambda cls: True))
     assert available() == available(QDLDL_UP_TO + 1) == ALL == ("mkl", "cholmod", "rslab", "qdldl", "superlu")
     assert available(QDLDL_UP_TO) == ("mkl", "cholmod", "qdldl", "rslab", "superlu")
-    monkeypatch.setattr(qdldl.Qdldl, "present", classmethod(lambda cls: False))
+    monkeypatch.setattr(qdldl.Qdldl, "is_installed", classmethod(lambda cls: False))
     assert available(1) == ("mkl", "cholmod", "rslab", "superlu")
 
 
@@ -79,7 +79,7 @@ def test_import_loads_no_backend():
     assert run.stdout.strip() == "[]"
 
 
-needs_rslab = pytest.mark.skipif(not rslab.Rslab.present(), reason="rslab is not installed")
+needs_rslab = pytest.mark.skipif(not rslab.Rslab.is_installed(), reason="rslab is not installed")
 
 
 class Panic(BaseException):
@@ -92,7 +92,7 @@ Panic.__name__ = "PanicException"
 @pytest.fixture
 def damaged(monkeypatch):
     """Make rslab's symbolic and numeric objects fail in a given way."""
-    if not rslab.Rslab.present():
+    if not rslab.Rslab.is_installed():
         pytest.skip("rslab is not installed")
     library = rslab.library()
     analyze = library.analyze
@@ -143,7 +143,7 @@ def raising(error):
 @pytest.mark.parametrize("error", [RuntimeError("index out of bounds"), Panic("called `unwrap`")])
 def test_another_backend_replaces_rslab_on_failure(damaged, monkeypatch, step, error, qdldl_present):
     if not qdldl_present:
-        monkeypatch.setattr(qdldl.Qdldl, "present", classmethod(lambda cls: False))
+        monkeypatch.setattr(qdldl.Qdldl, "is_installed", classmethod(lambda cls: False))
     damaged(**{step: raising(error)})
     A = stiffness(12)
     rng = np.random.default_rng(0)

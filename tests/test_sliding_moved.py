@@ -83,9 +83,9 @@ def test_a_body_close_to_a_given_wall_is_not_a_part_of_the_wall():
     assert np.all(np.abs(morphed.points[walls]).max(axis=1) == 1)
     loops = boundary_loops(F, len(V))
     held = BoundaryCurves(square.curves, fixed=body)
-    np.testing.assert_array_equal(held.off(loops, morphed.points), np.sort(body))
+    np.testing.assert_array_equal(held.find_off_curves(loops, morphed.points), np.sort(body))
     # A loop with a vertex that the caller assigns to a curve is on it, although all are fixed.
-    assert BoundaryCurves(square.curves, on={int(walls[0]): 0}, fixed=walls).off(loops, V).size == body.size
+    assert BoundaryCurves(square.curves, on={int(walls[0]): 0}, fixed=walls).find_off_curves(loops, V).size == body.size
 
 
 def test_vertices_of_no_triangle_are_numbered_as_well():

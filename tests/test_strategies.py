@@ -21,12 +21,11 @@ from quasiharmonic.solver.methods import (
     Untangling,
     VectorAdam,
     WideRepair,
-    reweighting,
+    random_restarts,
 )
 from quasiharmonic.solver.methods.base import SearchStage
 from quasiharmonic.solver.methods.local_repair import Patch, untangle_fully
-from quasiharmonic.solver.methods.random_restarts import find_nearest, left_of
-from quasiharmonic.solver.methods.reweighting import reweight
+from quasiharmonic.solver.methods.random_restarts import find_nearest, left_of, reweight
 from quasiharmonic.solver.methods.untangling import GRADINGS, Regularised, untangle
 from quasiharmonic.solver.search.stages import STRATEGIES, TentativeStage, stages_of
 from quasiharmonic.surfaces import grid
@@ -237,7 +236,7 @@ class TestReweighting:
         def inverted(w):
             return np.sum(signed_areas(patch.F, w) <= 0)
 
-        monkeypatch.setattr(reweighting, "untangle_fully", recorded)
+        monkeypatch.setattr(random_restarts, "untangle_fully", recorded)
         end = reweight(np.random.default_rng(0), patch, start, "auto")
         assert len(rounds) > 1
         no_worse = [w for w in rounds if inverted(w) <= inverted(start)]

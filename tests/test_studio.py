@@ -13,9 +13,9 @@ from quasiharmonic import Problem, certify, io, is_injective, quasi_harmonic_map
 from quasiharmonic.surfaces import cat, grid
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
 from quasiharmonic.ui.studio.session.drag import Follower, drag_weights
+from quasiharmonic.ui.studio.session.history import Storage
 from quasiharmonic.ui.studio.session.outlines import make_outline, make_polygon, read_drawing
 from quasiharmonic.ui.studio.session.session import Session
-from quasiharmonic.ui.studio.session.storage import Storage
 from shared.pages import Visitor, boundary
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'

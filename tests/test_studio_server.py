@@ -198,7 +198,7 @@ class Stuck:
     def end(self):
         self.ends.set()
 
-    async def ended(self):
+    async def wait_for_end(self):
         pass
 
 

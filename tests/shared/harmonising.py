@@ -12,7 +12,7 @@ from quasiharmonic import (
 )
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.solver.field.objective import Objective
-from quasiharmonic.solver.search.harmonised import Conformal, Harmonised
+from quasiharmonic.solver.search.harmonic_descent import Conformal, Harmonised
 from quasiharmonic.surfaces import grid, random_delaunay
 from quasiharmonic.targets import arc_length
 from shared.meshes import bend, boundary_of, lift
@@ -42,7 +42,7 @@ def objective_of(V, F, uv, fixed, energy, *, eta=0.3, conformal=0.2, weights=Non
     area = float(signed_areas(F, problem.frame.inward(uv)).sum())
     deformation = None if energy is None else DeformationEnergy(V, F, energy, area=area, weights=weights)
     regulariser = Conformal(objective.mesh.m / objective.mesh.m.sum())
-    return objective.descending(
+    return objective.with_functional(
         Harmonised(problem, objective.mesh, area, deformation, regulariser, eta=eta, conformal=conformal)
     )
 

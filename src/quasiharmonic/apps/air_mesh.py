@@ -41,10 +41,6 @@ from quasiharmonic.util.optional import explain_missing
 
 #: ARAP, and a barrier that keeps triangles from collapsing.
 _ELASTIC = Combination((1.0, ARAP()), (0.1, AreaBarrier()))
-# Shapes have converged when a Newton step predicts a relative decrease of the energy below this.
-_AT_REST = 1e-4
-# Steps of the frame are halved down to this fraction of its movement.
-_SHORTEST = 1 / 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,6 +183,8 @@ class AirMesh:
         RuntimeError
             If the move fails: the frame leaves no space, or crosses itself or a shape. The state is then unchanged.
         """
+        # Steps of the frame are halved down to this fraction of its movement.
+        shortest = 1 / 64
         there = self._stack(frame)
         n, present = len(self._rest), self.moment
         here, done, step = present.points[n:], 0.0, 1.0
@@ -196,7 +194,7 @@ class AirMesh:
                 reached = self._step(here + t * (there - here) if t < 1 else there, max_iterations)
                 if reached is not None:
                     self.moment, done = reached, t
-                elif step > _SHORTEST:
+                elif step > shortest:
                     step /= 2
                 else:
                     raise RuntimeError(
@@ -232,6 +230,8 @@ class AirMesh:
 
     def _converge(self, points: FloatArray) -> AirMeshState:
         """Converge the shapes from a valid state, with new air before and after."""
+        # Shapes have converged when a Newton step predicts a relative decrease of the energy below this.
+        at_rest = 1e-4
         n = len(self._rest)
         fixed = np.arange(n, len(points))
         last = np.inf
@@ -248,7 +248,7 @@ class AirMesh:
                 rest_F=np.concatenate([self._F, n + np.arange(air.size).reshape(-1, 3)]),
             )
             descent, model = newton_descent(energy, points, fixed, 0, "auto")
-            for _ in descent.descend(60, _AT_REST):
+            for _ in descent.descend(60, at_rest):
                 pass
             points = model.positions(descent.w)
             elastic = self._elastic(points)

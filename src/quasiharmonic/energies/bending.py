@@ -36,9 +36,6 @@ from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, list_others, repeat_each, to_complex
 
-_MAX_STEPS = 200
-_TOLERANCE = 1e-6
-
 
 @dataclass(frozen=True, eq=False)
 class Pull:
@@ -154,6 +151,9 @@ def bend_map(
 
     The domain is planar, and ``length`` is ℓ in its unit. The status is one of `quasiharmonic.polish`.
     """
+    # The descent converges below this relative decrease, and ends after this number of steps.
+    tolerance = 1e-6
+    max_steps = 200
     run = Run()
     inside = list_others(domain.n, np.concatenate(domain.loops))
     plate = Plate(domain.V, domain.F, inside, length, pull)
@@ -168,7 +168,7 @@ def bend_map(
         descent = NewtonDescent(model, model.evaluate(in_units(result.uv, exponent)))
     status = Status.INTERRUPTED
     with run.until_interrupted():
-        status = run.descend("bending", descent.descend(_MAX_STEPS, _TOLERANCE), lambda: descent.value)
+        status = run.descend("bending", descent.descend(max_steps, tolerance), lambda: descent.value)
     run.judge_last_stage(kept=descent.value < descent.first)
     uv = model.positions(descent.w)
     solver = system.solver.name

@@ -18,9 +18,6 @@ from quasiharmonic.util.arrays import ComplexArray
 
 Array = NDArray[np.inexact]
 
-# Step widths, relative to the size of ``x``.
-_WIDTHS = 10.0 ** np.arange(-2, -9, -1)
-
 
 def derivative_error(
     function: Callable[[Array], ArrayLike], derivative: Callable[[Array, Array], ArrayLike], x: Array, seed: int = 0
@@ -54,6 +51,8 @@ def derivative_error(
     >>> derivative_error(lambda x: np.sum(x**3), lambda x, d: np.sum(2 * x**2 * d), x) > 0.1
     True
     """
+    # Step widths, relative to the size of ``x``.
+    widths = 10.0 ** np.arange(-2, -9, -1)
     rng = np.random.default_rng(seed)
     size = max(float(np.abs(x).max(initial=0)), np.finfo(np.float64).tiny)
     worst = 0.0
@@ -62,7 +61,7 @@ def derivative_error(
         direction = d + 1j * rng.standard_normal(x.shape) * size if np.iscomplexobj(x) else d
         claimed = np.asarray(derivative(x, direction))
         errors = []
-        for h in _WIDTHS:
+        for h in widths:
             # The widest steps may leave the function's domain; the best width decides.
             with np.errstate(invalid="ignore"):
                 change = np.asarray(function(x + h * direction)) - np.asarray(function(x - h * direction))

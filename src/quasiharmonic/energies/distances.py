@@ -38,11 +38,6 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.progress import heartbeat
 
-# Search radius in mean edge lengths per ring.
-_REACH = 1.3
-# Approximate number of pairs that `_sample_each_row` processes at a time.
-_PAIRS_PER_CHUNK = 1 << 20
-
 
 @dataclass(frozen=True)
 class Sampling:
@@ -265,6 +260,8 @@ def sample_distances(
     Pairs are formed from the vertices ``among`` (m,), ascending; by default from all vertices of triangles. ``lowest``
     is passed to `straight_segments`.
     """
+    # Search radius in mean edge lengths per ring.
+    reach = 1.3
     rng = np.random.default_rng(seed)
     used = np.unique(F) if among is None else among
     source = used if sampling.sources >= used.size else np.sort(rng.choice(used, sampling.sources, replace=False))
@@ -279,19 +276,21 @@ def sample_distances(
         row, target = row[kept], target[kept]
     segments = straight_segments(V, F, sampling.crossings, lowest=lowest)
     mean_edge = (segments * edges).sum() / edges.nnz
-    length = chain_lengths(segments, source, row, target, float(_REACH * sampling.rings * mean_edge))
+    length = chain_lengths(segments, source, row, target, float(reach * sampling.rings * mean_edge))
     order = np.argsort(source[row], kind="stable")
     return SurfaceDistances(source[row][order], target[order], length[order], replace(sampling, sources=source.size))
 
 
 def _sample_each_row(row: IntArray, limit: int, rng: np.random.Generator) -> IntArray:
     """Indices of at most ``limit`` random entries of each row; ``row`` is ascending."""
+    # Approximate number of pairs that `_sample_each_row` processes at a time.
+    pairs_per_chunk = 1 << 20
     key = row + rng.random(row.size)
     kept = []
     begin = 0
     while begin < row.size:
         heartbeat()
-        end = int(np.searchsorted(row, row[min(begin + _PAIRS_PER_CHUNK, row.size) - 1], side="right"))
+        end = int(np.searchsorted(row, row[min(begin + pairs_per_chunk, row.size) - 1], side="right"))
         part = row[begin:end]
         order = np.argsort(key[begin:end])
         rank = np.arange(part.size) - np.searchsorted(part, part)

@@ -50,7 +50,7 @@ def available(entries: int | None = None) -> tuple[str, ...]:
 
     The order is for upper triangles with this number of entries, by default for large ones.
     """
-    present = [name for name in BACKENDS if _backend(name).present()]
+    present = [name for name in BACKENDS if _backend(name).is_installed()]
     if entries is not None and entries <= QDLDL_UP_TO and {"qdldl", "rslab"} <= set(present):
         rslab = present.index("rslab")
         present[rslab : rslab + 2] = "qdldl", "rslab"
@@ -103,7 +103,7 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
             except ImportError:
                 continue  # installed but broken; the last candidate is part of SciPy and always loads
     backend = _backend(name)
-    if not backend.present():
+    if not backend.is_installed():
         raise ImportError(
             f"linear solver {name!r} is not installed; available: {', '.join(available())}. "
             f"To install it: {backend.requirement}"

@@ -68,7 +68,7 @@ class ResidualTest:
         """A @ x for x of shape (n, k)."""
         return np.stack([_product(*self._matrix, column) for column in x.T], axis=1)
 
-    def plausible(self, b: FloatArray, x: FloatArray) -> bool:
+    def is_plausible(self, b: FloatArray, x: FloatArray) -> bool:
         """Whether all columns of x pass a test that needs no product with A.
 
         For the probe z = S·(random signs), zᵀ(b - A x) = zᵀb - (A z)ᵀx has the size of the scaled residual. A z is
@@ -176,7 +176,7 @@ class LinearSolver(ABC):
 
     name: ClassVar[str]
     requirement: ClassVar[str]
-    #: Python package that contains the library; None if `present` does not depend on a package.
+    #: Python package that contains the library; None if `is_installed` does not depend on a package.
     package: ClassVar[str | None] = None
     #: Whether the backend can use a given numbering instead of computing an order.
     takes_order: ClassVar[bool] = True
@@ -201,7 +201,7 @@ class LinearSolver(ABC):
         self._expected = time.monotonic() - began
 
     @classmethod
-    def present(cls) -> bool:
+    def is_installed(cls) -> bool:
         """Whether the library of this backend is installed; does not load it."""
         return cls.package is None or _is_installed(cls.package)
 
@@ -270,7 +270,7 @@ class LinearSolver(ABC):
             if not array.size:
                 return np.zeros(array.shape)
             x = self._solve(b)
-            if not self._test.plausible(b, x):
+            if not self._test.is_plausible(b, x):
                 x = self._check_residual(b, x)
         return x[:, 0] if array.ndim == 1 else x
 

@@ -21,6 +21,8 @@ plane cuts several sheets at once, and with long triangles planes are not short 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,16 +31,24 @@ from quasiharmonic.util.arrays import FloatArray, as_offsets
 IntArray = NDArray[np.integer]
 Codes = NDArray[np.int32]
 
-# Approximate number of vertices in the smallest parts made by median planes.
-_PART = 256
-# Number of random vertices per smallest part, from which the medians are computed. Within these parts, cuts at equal
-# distances are good enough: 2^BITS along each of the part's two longest sides.
-_SAMPLES = 8
+
+class DissectionTuning(NamedTuple):
+    """Numbers that tune the dissection."""
+
+    # Approximate number of vertices in the smallest parts made by median planes.
+    part: int = 256
+    # Number of random vertices per smallest part, from which the medians are computed.
+    samples: int = 8
+    # Limit on the sum of the cubes of the separator sizes over n^(3/2), which is proportional to the work of a
+    # factorisation. It is 2.2 to 3.4 for planar and gently curved meshes. At 8 (a scanned hand) a factorisation takes
+    # twice as long as with METIS's ordering, and ten factorisations lose the time gained in ordering.
+    max_work: float = 4.0
+
+
+_TUNING = DissectionTuning()
+
+# Within the smallest parts, cuts at equal distances are good enough: 2^BITS along each of the part's two longest sides.
 BITS = 4
-# Limit on the sum of the cubes of the separator sizes over n^(3/2), which is proportional to the work of a
-# factorisation. It is 2.2 to 3.4 for planar and gently curved meshes. At 8 (a scanned hand) a factorisation takes twice
-# as long as with METIS's ordering, and ten factorisations lose the time gained in ordering.
-_MAX_WORK = 4.0
 
 
 def nested_dissection(points: FloatArray, tail: IntArray, head: IntArray) -> NDArray[np.int64] | None:
@@ -47,11 +57,11 @@ def nested_dissection(points: FloatArray, tail: IntArray, head: IntArray) -> NDA
     The result is None if planes make poor cuts, because the surface is folded or the points coincide.
     """
     n = len(points)
-    levels = max(0, int(np.ceil(np.log2(max(n / _PART, 1)))))
+    levels = max(0, int(np.ceil(np.log2(max(n / _TUNING.part, 1)))))
     part = _bisect(points, levels)
     code = (part << 2 * BITS) | _grid_cells(points, part, 1 << levels)
     rank = separators(code, levels, tail, head)
-    if _factor_work(code, rank) > _MAX_WORK * n**1.5:
+    if _factor_work(code, rank) > _TUNING.max_work * n**1.5:
         return None
     # A part of rank k is a range of 2^k codes. Its separator follows the last code and the separators of its own parts.
     end = ((code >> rank) + 1) << rank
@@ -61,7 +71,7 @@ def nested_dissection(points: FloatArray, tail: IntArray, head: IntArray) -> NDA
 def _bisect(points: FloatArray, levels: int) -> Codes:
     """Part of each point after ``levels`` bisections; the first cut is the highest bit."""
     n, d = points.shape
-    sample = points[np.random.default_rng(0).integers(n, size=_SAMPLES << levels)][None]
+    sample = points[np.random.default_rng(0).integers(n, size=_TUNING.samples << levels)][None]
     flat, start = points.ravel(), np.arange(0, n * d, d, dtype=np.int32)
     part = np.zeros(n, dtype=np.int32)
     for _ in range(levels):

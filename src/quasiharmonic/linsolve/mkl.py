@@ -12,6 +12,7 @@ import weakref
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,19 +20,35 @@ from quasiharmonic.linsolve.base import LinearSolver, NotPositiveDefinite, Patte
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.threads import read_limit
 
-# PARDISO's phases.
-_ANALYSE = 11
-_FACTOR = 22
-_SOLVE = 33
-_FORWARD_ONLY = 331
-_RELEASE = -1
-# Values of iparm[1]: the elimination order.
-_MINIMUM_DEGREE = 0
-_PARALLEL_DISSECTION = 3
-# Values of iparm[23]: the parallel factorisation.
-_CLASSIC_TWO_LEVEL = 1
-_IMPROVED_TWO_LEVEL = 10
-_INTEL_THREADS = 0
+
+class PardisoPhases(NamedTuple):
+    """PARDISO's phases."""
+
+    analyse: int = 11
+    factor: int = 22
+    solve: int = 33
+    forward_only: int = 331
+    release: int = -1
+
+
+_PHASES = PardisoPhases()
+
+
+class PardisoOptions(NamedTuple):
+    """Values of PARDISO's parameters."""
+
+    # Values of iparm[1]: the elimination order.
+    minimum_degree: int = 0
+    parallel_dissection: int = 3
+    # Values of iparm[23]: the parallel factorisation.
+    classic_two_level: int = 1
+    improved_two_level: int = 10
+    # MKL's threading layer.
+    intel_threads: int = 0
+
+
+_OPTIONS = PardisoOptions()
+
 
 # Below this number of unknowns: minimum degree ordering and one thread. Above: dissection and all threads. For 10,000
 # unknowns METIS takes 25 ms to order instead of 10 ms and saves 1 ms of 4 ms in parallel factorisation. Small tasks on
@@ -65,7 +82,7 @@ class MKL(LinearSolver):
     requirement = "pip install mkl (x86-64 Linux and Windows)"
 
     @classmethod
-    def present(cls) -> bool:
+    def is_installed(cls) -> bool:
         """Whether MKL's runtime library is found."""
         return find_mkl() is not None
 
@@ -90,7 +107,7 @@ class MKL(LinearSolver):
         """Analyse a pattern with the number of threads that is currently allowed."""
         handle = Handle(indptr, indices, values, sequential=sequential, ordered=self._ordered)
         self._release_once = weakref.finalize(self, handle.release)
-        handle.check(_ANALYSE)
+        handle.check(_PHASES.analyse)
         return handle
 
     def _factor(self) -> None:
@@ -101,12 +118,12 @@ class MKL(LinearSolver):
             self.handle = self._begin(*self.handle.pattern, self.handle.sequential)
         if self._size > self.n:
             self._entries[:] = self._values
-        self.handle.check(_FACTOR)
+        self.handle.check(_PHASES.factor)
         # The improved two-level algorithm takes the square root of a negative pivot and continues. The NaN spreads to
         # all dependent entries. A forward solve with one right-hand side detects it, in 5 % of the factorisation time.
         if self.handle.improved:
             forward = np.empty_like(self._ones)
-            self.handle.check(_FORWARD_ONLY, self._ones, forward)
+            self.handle.check(_PHASES.forward_only, self._ones, forward)
             if not np.isfinite(forward.sum()):
                 raise NotPositiveDefinite("the matrix is not positive definite: PARDISO found a negative pivot")
 
@@ -117,7 +134,7 @@ class MKL(LinearSolver):
         if columns < self._min_columns:
             b = np.asfortranarray(np.repeat(b, self._min_columns, axis=1))
         x = np.empty_like(b, order="F")
-        self.handle.check(_SOLVE, b, x)
+        self.handle.check(_PHASES.solve, b, x)
         return np.asfortranarray(x[: self.n, :columns])
 
     def _release(self) -> None:
@@ -143,7 +160,7 @@ class Handle:
         self.memory = np.zeros(64, dtype=np.int64)
         self.iparm = np.zeros(64, dtype=np.int32)
         self.iparm[0] = 1  # use no defaults
-        self.iparm[1] = _MINIMUM_DEGREE if sequential else _PARALLEL_DISSECTION
+        self.iparm[1] = _OPTIONS.minimum_degree if sequential else _OPTIONS.parallel_dissection
         self.iparm[4] = ordered
         # No iterative refinement: zero disables it for Cholesky (a negative count refines in extended precision).
         self.iparm[7] = 0
@@ -152,7 +169,7 @@ class Handle:
         # ordering. On several threads it may crash at a negative pivot if the elimination order is a chain, as for a
         # mesh numbered row by row (MKL 2026.2). This did not happen in 1,000 indefinite matrices ordered by dissection.
         self.improved = sequential or ordered
-        self.iparm[23] = _IMPROVED_TWO_LEVEL if self.improved else _CLASSIC_TWO_LEVEL
+        self.iparm[23] = _OPTIONS.improved_two_level if self.improved else _OPTIONS.classic_two_level
         self.iparm[34] = 1  # indices count from zero
 
         self._phase = ctypes.c_int(0)
@@ -182,7 +199,7 @@ class Handle:
         """Run one phase and turn its error code into an exception."""
         code = self.call(phase, b, x)
         # Positive codes are not documented; they occur when a pivot is negative.
-        if code in _NOT_POSITIVE_DEFINITE or (code > 0 and phase == _FACTOR):
+        if code in _NOT_POSITIVE_DEFINITE or (code > 0 and phase == _PHASES.factor):
             raise NotPositiveDefinite("the matrix is not positive definite: PARDISO found a pivot that is not positive")
         if code:
             text = f"MKL PARDISO failed in phase {phase} with error {code}: {_ERRORS.get(code, 'unknown error')}"
@@ -190,7 +207,7 @@ class Handle:
 
     def release(self) -> None:
         """Release the memory of PARDISO."""
-        self.call(_RELEASE, None, None)
+        self.call(_PHASES.release, None, None)
 
     def call(self, phase: int, b: FloatArray | None, x: FloatArray | None) -> int:
         self._phase.value = phase
@@ -242,7 +259,7 @@ def load_mkl() -> ctypes.CDLL:
     if layer & 1:
         raise ImportError("MKL is set to 64-bit integers (ILP64) in this process; PARDISO is called with 32-bit ones")
     # By default MKL uses GNU threads if another package, such as gmsh, has loaded them, and PARDISO then crashes.
-    library.MKL_Set_Threading_Layer(_INTEL_THREADS)
+    library.MKL_Set_Threading_Layer(_OPTIONS.intel_threads)
     library.pardiso.restype = None
     return library
 

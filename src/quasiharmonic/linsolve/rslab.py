@@ -30,12 +30,8 @@ from quasiharmonic.util.threads import count_cores, read_limit
 # (300,000 unknowns: 3.3 s against 0.3 to 0.6 s), and its factor is less than twice as fast. rslab accepts no given
 # order.
 _ORDERING = "amf"
-# Supernodes with fewer columns are merged. Half of rslab's default saves up to a tenth of factor and solve times.
-_NEMIN = 8
 #: Number of unknowns below which threads do not help.
 SEQUENTIAL_BELOW = 30_000
-# More threads bring no gain.
-_MAX_THREADS = 4
 # Variables that limit the threads of other libraries also limit rslab's factorisation, which accepts a number of
 # threads. Its solves take a tenth of the time and obey only RAYON_NUM_THREADS (rslab 1.7).
 _LIMITS = "OMP_NUM_THREADS", "RAYON_NUM_THREADS"
@@ -70,13 +66,16 @@ class Rslab(LinearSolver):
 
     def _find_symbolic(self) -> Any:
         """Analyse the pattern; None if rslab fails."""
+        # Supernodes with fewer columns are merged. Half of rslab's default saves up to a tenth of factor and solve
+        # times.
+        nemin = 8
         from scipy.sparse import csc_matrix
 
         # The upper triangle by rows is the lower triangle by columns, which rslab reads.
         pattern = csc_matrix((np.ones(self.nnz), self._indices, self._indptr), shape=(self.n, self.n))
         threads = 1 if self.n < SEQUENTIAL_BELOW else _threads()
         return self._try(
-            lambda: library().analyze(pattern, path="ldlt", ordering=_ORDERING, nemin=_NEMIN, threads=threads)
+            lambda: library().analyze(pattern, path="ldlt", ordering=_ORDERING, nemin=nemin, threads=threads)
         )
 
     def _factor(self) -> None:
@@ -120,7 +119,7 @@ class Rslab(LinearSolver):
         If that fails too, rslab's factor is kept, so that later solves fail in the same way.
         """
         if self._fallback is None:
-            other = Qdldl if Qdldl.present() else SuperLU
+            other = Qdldl if Qdldl.is_installed() else SuperLU
             self._fallback = other(self._indptr, self._indices)
         self._fallback.factor(self._values)
         self._numeric = None
@@ -182,4 +181,6 @@ def _import_and_wait(loaded: Future[Any]) -> None:
 
 def _threads() -> int:
     """Number of threads that the machine and the environment allow, up to the useful maximum."""
-    return max(1, min(_MAX_THREADS, count_cores(), read_limit(_LIMITS)))
+    # More threads bring no gain.
+    max_threads = 4
+    return max(1, min(max_threads, count_cores(), read_limit(_LIMITS)))

@@ -30,8 +30,6 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 
-# Maximum number of elements that the text lists for a class of defects.
-_LISTED = 5
 # Vertices are close if their distance is at most this multiple of the diagonal of the bounding box.
 _CLOSE = 1e-6
 
@@ -340,5 +338,7 @@ def _volumes(V: FloatArray, F: IntArray, part: IntArray, count: int) -> FloatArr
 
 def _name_first(found: IntArray) -> str:
     """Name the first elements."""
-    listed = (str(tuple(one)) if isinstance(one, list) else str(one) for one in found[:_LISTED].tolist())
-    return ", ".join(listed) + (", …" if len(found) > _LISTED else "")
+    # Maximum number of elements that the text lists for a class of defects.
+    listed_at_most = 5
+    listed = (str(tuple(one)) if isinstance(one, list) else str(one) for one in found[:listed_at_most].tolist())
+    return ", ".join(listed) + (", …" if len(found) > listed_at_most else "")

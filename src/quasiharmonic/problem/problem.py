@@ -39,8 +39,6 @@ from quasiharmonic.util.display import Displayable
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Largest binary exponent of a mesh's size, in absolute value, so that lengths neither overflow nor underflow.
-_MAX_EXPONENT = 400
 
 # V, F, fixed and target of a problem.
 Given = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
@@ -377,9 +375,11 @@ def _surfaces(F: IntArray, starts: IntArray) -> Edges | None:
 
 def _have_areas(V: NDArray[np.float64], F: IntArray, starts: IntArray) -> bool:
     """Return whether all triangles have a positive rest area, computed as in `Domain.check_areas`."""
+    # Largest binary exponent of a mesh's size, in absolute value, so that lengths neither overflow nor underflow.
+    max_exponent = 400
     size = np.maximum.reduceat(np.abs(V).max(axis=1), as_offsets(starts[:-1]))
     exponent = np.frexp(size)[1]
-    if (np.abs(exponent) > _MAX_EXPONENT).any():
+    if (np.abs(exponent) > max_exponent).any():
         return False
     z1, z2 = rest_frames(np.ldexp(V, -repeat_each(exponent, np.diff(starts))[:, None]), F)
     return not ((z1 == 0) | (z2.imag == 0)).any()

@@ -23,9 +23,6 @@ BoolArray = NDArray[np.bool_]
 SignArray = NDArray[np.int8]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-# Number of elements that a message lists.
-_LISTED = 5
-
 
 class ReadOnly:
     """Base class of objects whose arrays are read-only, also in copies and after unpickling."""
@@ -489,20 +486,18 @@ def check_callback(callback: Any) -> None:
         raise ValueError(f"callback must be callable, or None, not {describe(callback)}")
 
 
-# Cells of the curve of `morton_order`: 2 to this power along the longest side of the points' bounding box.
-_CURVE_BITS = 10
-
-
 def morton_order(points: FloatArray) -> IntArray:
     """Order of points (n, d) along Morton's curve, so that consecutive points are close to each other."""
+    # Cells of the curve of `morton_order`: 2 to this power along the longest side of the points' bounding box.
+    bits = 10
     if not len(points):
         return np.empty(0, dtype=np.int64)
     # Halve first, so that the extent of numbers near the largest double does not overflow.
     offset = points / 2 - points.min(axis=0) / 2
     size = float(offset.max())
-    cell = (offset / (size if size > 0 else 1.0) * ((1 << _CURVE_BITS) - 1)).astype(np.int64)
+    cell = (offset / (size if size > 0 else 1.0) * ((1 << bits) - 1)).astype(np.int64)
     code = np.zeros(len(points), dtype=np.int64)
-    for bit in range(_CURVE_BITS):
+    for bit in range(bits):
         for axis, along in enumerate(cell.T):
             code |= (along >> bit & 1) << (len(cell.T) * bit + axis)
     return np.argsort(code, kind="stable")
@@ -520,8 +515,10 @@ def count_of(one: str, many: str, count: int) -> str:
 
 def names_of(one: str, many: str, indices: NDArray[np.integer]) -> str:
     """Name the first few of some elements: ``vertices 3, 8, 11, … (17 in all)``. Each is an index or a row."""
-    listed = ", ".join(str(tuple(i) if isinstance(i, list) else i) for i in indices[:_LISTED].tolist())
-    rest = f", … ({len(indices)} in all)" if len(indices) > _LISTED else ""
+    # Number of elements that a message lists.
+    listed_at_most = 5
+    listed = ", ".join(str(tuple(i) if isinstance(i, list) else i) for i in indices[:listed_at_most].tolist())
+    rest = f", … ({len(indices)} in all)" if len(indices) > listed_at_most else ""
     return f"{one if len(indices) == 1 else many} {listed}{rest}"
 
 

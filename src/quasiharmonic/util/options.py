@@ -100,7 +100,7 @@ def positive_number(name: str, value: Any) -> None:
 seconds = _or_none(positive_number)
 
 
-def welding(name: str, value: Any) -> None:
+def check_welding(name: str, value: Any) -> None:
     """Check which vertices are welded: a boolean or a relative distance."""
     from quasiharmonic.util.arrays import check_weld
 
@@ -161,13 +161,13 @@ def texture_size(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be a number of texels, or width and height, at most 8192, not {value!r}")
 
 
-def stacking(name: str, value: Any) -> None:
+def check_stacking(name: str, value: Any) -> None:
     """Check which charts are stacked: a boolean or ``"mirrored"``."""
     if not isinstance(value, bool) and value != "mirrored":
         raise ValueError(f"{name} must be True, False or 'mirrored', not {value!r}")
 
 
-def sharing(name: str, value: Any) -> None:
+def check_instances(name: str, value: Any) -> None:
     """Check what instances of a mesh do; one mesh has none."""
     if value != "share":
         raise ValueError(f"{name}={value!r} needs several meshes: pass a list of meshes, or a scene")
@@ -355,7 +355,7 @@ class FlattenOptions(DistanceOptions):
     time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     unit_square: bool = option(False, "scale the map evenly into the unit square", check=switch)
     gap: float = option(0.0, check=tolerance)
-    weld: Any = option(False, check=welding)
+    weld: Any = option(False, check=check_welding)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -479,11 +479,11 @@ class UnwrapOptions(Options):
         check=switch,
     )
     rotate: bool = option(True)
-    stack: Any = option(False, check=stacking)
+    stack: Any = option(False, check=check_stacking)
     outward: bool = option(False, "treat closed components that are inside out as turned outward", check=switch)
-    weld: Any = option(True, check=welding)
+    weld: Any = option(True, check=check_welding)
     meshes: Any = option(None)
-    instances: str = option("share", check=sharing)
+    instances: str = option("share", check=check_instances)
     weights: Any = option(None, check=no_weights)
     edge_costs: Any = option(None)
     seams: Any = option(None)

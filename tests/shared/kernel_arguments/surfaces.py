@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic import boundary_loops
-from quasiharmonic.apps.atlas.packing.contact import list_runs
+from quasiharmonic.apps.atlas.packing.board import list_runs
 from quasiharmonic.geometry.coarsening.levels import allocate_round, remove_vertices
 from quasiharmonic.surfaces import annulus, disk
 from quasiharmonic.targets.cuts.graph import edge_graph

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TypedDict, Unpack
+from typing import NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,13 +31,20 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray
 from quasiharmonic.util.options import AnimationOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
-# Maximum number of short steps. A frame close to the previous one hardly ever needs more; if they fail, a diagnosis
-# follows.
-_SOON = 6
-# Step length, a fifth of the usual first steps: if these fail, short ones lead less far away.
-_SHORT_STEPS = ((0, 0.1),)
-# Default maximum vertex displacement, relative to the maximum boundary displacement.
-_LIMIT = 3.0
+
+class FrameTuning(NamedTuple):
+    """Numbers that tune the search for the map of a frame."""
+
+    # Maximum number of short steps. A frame close to the previous one hardly ever needs more; if they fail, a diagnosis
+    # follows.
+    max_short_steps: int = 6
+    # Step length, a fifth of the usual first steps: if these fail, short ones lead less far away.
+    short_steps: tuple[tuple[int, float], ...] = ((0, 0.1),)
+    # Default maximum vertex displacement, relative to the maximum boundary displacement.
+    limit: float = 3.0
+
+
+_TUNING = FrameTuning()
 
 
 class FrameSearch:
@@ -107,10 +114,10 @@ class FrameSearch:
 
     def _search_nearby(self, problem: Problem, start: ArrayLike) -> MapResult:
         """Return the result of a few short steps from a map."""
-        few = min(_SOON, self._options.max_iterations)
+        few = min(_TUNING.max_short_steps, self._options.max_iterations)
         # As in the default strategy, pins need si-log.
         parameterisation = "si-log" if problem.domain.pins.size else "tanh"
-        short = VectorAdam(parameterisation=parameterisation, schedule=_SHORT_STEPS, iterations=few)
+        short = VectorAdam(parameterisation=parameterisation, schedule=_TUNING.short_steps, iterations=few)
         return self._solve(problem, start, few, [short])
 
     def _solve(
@@ -233,7 +240,7 @@ def animate(problem: Problem, targets: Iterable[ArrayLike], **options: Unpack[An
         asked, bridged = following.fill_gaps()
     energies = np.full(len(frames), np.nan)
     if energy is not None:
-        limit = _LIMIT if limit is None else float(limit)
+        limit = _TUNING.limit if limit is None else float(limit)
         if not following.work.interrupted:
             smoothing = MotionSmoothing(problem.domain, energy, limit, checked.linear_solver)
             energies = _smooth_frames(smoothing, following, asked)

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,20 +36,28 @@ from quasiharmonic.energies.polishing import scale_energy
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
-# Weight of the proximal term in the forward pass, as a fraction of the mean energy.
-_PROXIMAL_WEIGHT = 0.5
-# Lower bound of that mean energy.
-_MIN_ENERGY = 1.0
-# The forward pass does not penalise displacements up to this multiple of the boundary's displacement.
-_FREE_MOTION = 1.5
-# Factor of the weight in the first sweep.
-_SWEEP_WEIGHT = 300.0
-# Factor of the weight from one sweep to the next.
-_SWEEP_GROWTH = 1.5
-# Moves within this fraction of the limit cost nothing in a sweep.
-_FREE_SHARE = 0.9
-_SWEEPS = 40
-_TOLERANCE = 1e-4
+
+class SmoothingTuning(NamedTuple):
+    """Numbers that tune the forward pass and the sweeps."""
+
+    # Weight of the proximal term in the forward pass, as a fraction of the mean energy.
+    proximal_weight: float = 0.5
+    # Lower bound of that mean energy.
+    min_energy: float = 1.0
+    # The forward pass does not penalise displacements up to this multiple of the boundary's displacement.
+    free_motion: float = 1.5
+    # Factor of the weight in the first sweep.
+    sweep_weight: float = 300.0
+    # Factor of the weight from one sweep to the next.
+    sweep_growth: float = 1.5
+    # Moves within this fraction of the limit cost nothing in a sweep.
+    free_share: float = 0.9
+    # Maximum number of sweeps, and relative decrease below which they end.
+    sweeps: int = 40
+    tolerance: float = 1e-4
+
+
+_TUNING = SmoothingTuning()
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +151,8 @@ class MotionSmoothing:
             fixed = self.domain.fixed
             self._lengths.append(find_longest(uv[fixed] - self.maps[-1][fixed]))
             before = [Neighbour(self.maps[-1], self._lengths[-1])]
-        weight = _PROXIMAL_WEIGHT * max(_MIN_ENERGY, self.energies[-1] if self.energies else 0.0)
-        lowered, energy = self._lower(uv, before, ProximalPenalty(weight, _FREE_MOTION), steps=60)
+        weight = _TUNING.proximal_weight * max(_TUNING.min_energy, self.energies[-1] if self.energies else 0.0)
+        lowered, energy = self._lower(uv, before, ProximalPenalty(weight, _TUNING.free_motion), steps=60)
         self.maps.append(lowered)
         self.energies.append(energy)
         if before:
@@ -163,8 +172,12 @@ class MotionSmoothing:
 
         ``report`` is called with the number of the sweep, from 1, and the frame.
         """
-        weight = _PROXIMAL_WEIGHT * _SWEEP_WEIGHT * max(_MIN_ENERGY, sum(self.energies) / max(len(self.energies), 1))
-        for sweep in range(1, _SWEEPS + 1):
+        weight = (
+            _TUNING.proximal_weight
+            * _TUNING.sweep_weight
+            * max(_TUNING.min_energy, sum(self.energies) / max(len(self.energies), 1))
+        )
+        for sweep in range(1, _TUNING.sweeps + 1):
             if self.largest_move() <= self._limit:
                 return
             # Alternate the direction, so that the next frame takes up the change of the previous one.
@@ -173,11 +186,11 @@ class MotionSmoothing:
                 beside = range(max(t - 1, 0), min(t + 1, len(self._moves)))
                 if any(self._moves[one] > self._limit for one in beside):
                     report(sweep, t)
-                    penalty = ProximalPenalty(weight, _FREE_SHARE * self._limit)
+                    penalty = ProximalPenalty(weight, _TUNING.free_share * self._limit)
                     self.maps[t], self.energies[t] = self._lower(self.maps[t], self._neighbours(t), penalty, steps=20)
                     for one in beside:
                         self._measure(one)
-            weight *= _SWEEP_GROWTH
+            weight *= _TUNING.sweep_growth
 
     def _neighbours(self, t: int) -> list[Neighbour]:
         before = [Neighbour(self.maps[t - 1], self._lengths[t - 1])] if t > 0 else []
@@ -198,6 +211,6 @@ class MotionSmoothing:
             terms = [ProximalTerm(neighbour, penalty, exponent) for neighbour in around]
             model = MapModel(energy, Coordinates.of(uv, domain.fixed, exponent), self._system, terms)
             descent = NewtonDescent(model, model.evaluate(in_units(uv, exponent)))
-            for _ in descent.descend(steps, _TOLERANCE):
+            for _ in descent.descend(steps, _TUNING.tolerance):
                 pass
             return model.positions(descent.w), energy.value_of(descent.state.derivatives)

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 #: Factor that reflects a map about the v axis.
 MIRROR = np.array([-1.0, 1.0])
 
-# Maximum number of pairs listed; stacked islands can overlap in all pairs.
-_MAX_PAIRS = 1000
-
 
 @dataclass(frozen=True, eq=False)
 class IslandReport:
@@ -250,6 +247,8 @@ def is_mirrored(F: IntArray, uv: FloatArray) -> bool:
 
 def _find_overlaps(islands: Sequence[Island], judged: Sequence[IslandVerdict]) -> IntArray:
     """Pairs of bijective islands that are not bijective together."""
+    # Maximum number of pairs listed; stacked islands can overlap in all pairs.
+    max_pairs = 1000
     sound = [k for k, verdict in enumerate(judged) if verdict.bijective]
     if len(sound) < 2:
         return np.empty((0, 2), dtype=np.int64)
@@ -259,7 +258,7 @@ def _find_overlaps(islands: Sequence[Island], judged: Sequence[IslandVerdict]) -
     for row, k in enumerate(sound):
         near = (low[row + 1 :] <= high[row]).all(axis=1) & (high[row + 1 :] >= low[row]).all(axis=1)
         for other in np.flatnonzero(near) + row + 1:
-            if len(pairs) == _MAX_PAIRS:
+            if len(pairs) == max_pairs:
                 break
             if not _are_disjoint(islands[k], islands[sound[other]], judged[k].mirrored, judged[sound[other]].mirrored):
                 pairs.append((k, sound[other]))

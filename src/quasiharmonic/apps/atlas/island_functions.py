@@ -118,7 +118,7 @@ def polish(
             return polish_map(_domain(island, checked), island.uv, PolishOptions(**own, **rest))
         held = _select_fixed(island, checked)
         domain = Domain(island.V, island.F, np.union1d(held, _select_fixed(island, None)))
-        curves = sliding_curves(slide, domain.loops, island.uv).keeping(held)
+        curves = sliding_curves(slide, domain.loops, island.uv).with_fixed(held)
         return polish_map(domain, island.uv, PolishOptions(**own, **rest | {"slide": curves}))
 
     return each_island(mesh, lower, only=islands)

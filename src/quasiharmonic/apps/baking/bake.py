@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, TypedDict, Unpack
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
@@ -26,12 +26,21 @@ from quasiharmonic.util.outcome import BaseOutcome, as_plain
 
 #: Colour of texels that are too far from the old model, 8-bit sRGB.
 MISSING = (255, 0, 255)
-# Samples per block of rows.
-_BLOCK = 1 << 17
-# Two meshes are the same if their corners are this close, relative to the size.
-_SAME = 1e-6
-# Triangles whose area is below this share of the square of their longest side are degenerate.
-_THIN = 1e-12
+
+
+class BakeTuning(NamedTuple):
+    """Numbers that tune the transfer of texels."""
+
+    # Samples per block of rows.
+    block: int = 1 << 17
+    # Two meshes are the same if their corners are this close, relative to the size.
+    same: float = 1e-6
+    # Triangles whose area is below this share of the square of their longest side are degenerate.
+    thin: float = 1e-12
+
+
+_TUNING = BakeTuning()
+
 
 MeshOrPath = MeshData | str | os.PathLike[str]
 
@@ -234,7 +243,9 @@ class _Baker:
         self._corners = new.V[new.F]
         diagonal = float(np.linalg.norm(np.ptp(self._corners.reshape(-1, 3), axis=0)))
         self._reach = wanted.max_distance * diagonal
-        self._same = len(old.F) == len(new.F) and bool((np.abs(old.V[old.F] - self._corners) <= _SAME * diagonal).all())
+        self._same = len(old.F) == len(new.F) and bool(
+            (np.abs(old.V[old.F] - self._corners) <= _TUNING.same * diagonal).all()
+        )
         self._nearest = None if self._same else NearestPoint(old.V, old.F)
         uv = new.corner_uv
         self._raster = self._make_raster(uv)
@@ -262,7 +273,7 @@ class _Baker:
             self.problems.append(f"{count} outside the unit square of the new texture coordinates, and not baked")
         a, b, c = self._corners.swapaxes(0, 1)
         longest = np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-        degenerate = np.linalg.norm(np.cross(b - a, c - a), axis=1) <= _THIN * longest
+        degenerate = np.linalg.norm(np.cross(b - a, c - a), axis=1) <= _TUNING.thin * longest
         samples = self._wanted.samples
         scale = np.array([self._width, -self._height]) * samples
         placed = np.nan_to_num(uv * scale + [0, self._height * samples])
@@ -308,7 +319,7 @@ class _Baker:
     def _blocks(self) -> Iterator[tuple[slice, IntArray, IntArray, FloatArray]]:
         """Yield blocks of rows, with the texels, triangles and barycentric coordinates of the samples in triangles."""
         samples = self._wanted.samples
-        step = max(1, _BLOCK // (self._width * samples**2))
+        step = max(1, _TUNING.block // (self._width * samples**2))
         for begin in range(0, self._height, step):
             rows = slice(begin, min(begin + step, self._height))
             sample, triangle, barycentric = self._raster.rows(rows.start * samples, rows.stop * samples)

@@ -9,6 +9,7 @@ import time
 from dataclasses import dataclass
 from itertools import product
 from numbers import Real
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,14 +42,22 @@ from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, check_choice, count_of
 
-# Coefficients of at most this multiple of a bound of their terms may be rounding errors.
-_ROUNDING = 2.0**-46
+
+class NearestTuning(NamedTuple):
+    """Numbers that tune the search for the nearest field."""
+
+    # Coefficients of at most this multiple of a bound of their terms may be rounding errors.
+    rounding: float = 2.0**-46
+    # Pixels closer than this to their original position, in pixels, return to it.
+    return_distance: float = 1e-6
+    # Maximum number of times that patches grow.
+    max_rounds: int = 12
+
+
+_TUNING = NearestTuning()
+
 #: How a field on voxels is sampled between them.
 INTERPOLATIONS = "linear", "trilinear"
-# Pixels closer than this to their original position, in pixels, return to it.
-_RETURN_DISTANCE = 1e-6
-# Maximum number of times that patches grow.
-_MAX_ROUNDS = 12
 
 
 def least_coefficients(grid: VoxelGrid, field: FloatArray) -> FloatArray:
@@ -77,7 +86,7 @@ def least_coefficients(grid: VoxelGrid, field: FloatArray) -> FloatArray:
         # A coefficient is the sum of its terms divided by three binomial coefficients.
         share = np.array([1.0, 0.5, 1.0])
         factor = (share[:, None, None] * share[:, None] * share)[..., None, None]
-        least[z] = (factor * (total - _ROUNDING * bound)).min(axis=(0, 1, 2))
+        least[z] = (factor * (total - _TUNING.rounding * bound)).min(axis=(0, 1, 2))
     return least
 
 
@@ -287,7 +296,7 @@ def _descend(grid: PixelGrid, given: ComplexArray, fixed: BoolArray, min_jacobia
             f"{name_points(none.mask)}. Fix fewer pixels around these"
         ) from none
     moving = patch
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(_TUNING.max_rounds):
         descend_patches(grid, w, given, moving, min_jacobian)
         _return_near_pixels(grid, w, given, min_jacobian)
         grown = grow_pressing(w != given, moving, fixed)
@@ -300,7 +309,7 @@ def _descend(grid: PixelGrid, given: ComplexArray, fixed: BoolArray, min_jacobia
 
 def _return_near_pixels(grid: PixelGrid, w: ComplexArray, given: ComplexArray, min_jacobian: float) -> None:
     """Return pixels that are nearly at their original positions to them, unless this makes a fold."""
-    close = (w != given) & (np.abs(w - given) < _RETURN_DISTANCE)
+    close = (w != given) & (np.abs(w - given) < _TUNING.return_distance)
     before = w[close]
     w[close] = given[close]
     if find_folds(grid, w, min_jacobian).any():

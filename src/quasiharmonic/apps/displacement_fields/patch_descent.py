@@ -44,37 +44,49 @@ from quasiharmonic.util.progress import heartbeat
 if TYPE_CHECKING:
     from scipy.sparse import dia_array
 
-# The penalty's width d.
-_WIDTH = 0.05
-# The barrier's weights κ, its widths d and the maximum numbers of steps, in turn; then those if a patch has more than
-# _LARGE pixels. Steps of a patch with many folds to a thin barrier are short.
-_BARRIERS = (1e-3, _WIDTH, 100), (1e-5, _WIDTH, 100)
-_WIDE_BARRIERS = (1e-1, 0.5, 20), (1e-2, 0.2, 20), (1e-3, _WIDTH, 40), (1e-5, _WIDTH, 40)
-_LARGE = 5_000
-# The penalty's weights in turn.
-_PENALTIES = 1e-2, 1e-1, 1.0, 10.0, 100.0
-# A patch has converged if Newton's model predicts a decrease below this fraction of its value.
-_TOLERANCE = 1e-6
-# It has also converged below this decrease in squared pixels.
-_ZERO_DECREASE = 1e-14
-# It has also converged if a step lowers its value by less than this fraction.
-_IDLE = 1e-9
-# Maximum number of steps for one weight of the penalty.
-_MAX_PENALTY_STEPS = 10
-# Maximum number of lengths of one step.
-_MAX_HALVINGS = 30
-# Fraction of the step to the first collapse, as in the other Newton descents.
-_FRACTION = 0.9
-# Diagonal shifts, tried in this order until the matrix is positive definite.
-_SHIFTS = 0.0, 1e-12, 1e-8, 1e-4
-# Approximate number of free pixels in one matrix.
-_AT_ONCE = 20_000
-# Distance in pixels around folded cells, and around patches whose border moves, that becomes free.
-_MARGIN = 4
-# Distance in pixels around folds in which displacements become harmonic; it grows by a half if folds remain.
-_NEAR = 2
-# Growth factor of the smoothing's standard deviation in pixels.
-_SMOOTHER = 1.2
+
+class PatchTuning(NamedTuple):
+    """Numbers that tune the descent on patches of pixels."""
+
+    # The penalty's width d.
+    width: float = 0.05
+    # The barrier's weights κ, its widths d and the maximum numbers of steps, in turn.
+    barriers: tuple[tuple[float, float, int], ...] = (1e-3, width, 100), (1e-5, width, 100)
+    # The same if a patch has more than `large` pixels. Steps of a patch with many folds to a thin barrier are short.
+    wide_barriers: tuple[tuple[float, float, int], ...] = (
+        (1e-1, 0.5, 20),
+        (1e-2, 0.2, 20),
+        (1e-3, width, 40),
+        (1e-5, width, 40),
+    )
+    large: int = 5_000
+    # The penalty's weights in turn.
+    penalties: tuple[float, ...] = (1e-2, 1e-1, 1.0, 10.0, 100.0)
+    # A patch has converged if Newton's model predicts a decrease below this fraction of its value.
+    tolerance: float = 1e-6
+    # It has also converged below this decrease in squared pixels.
+    zero_decrease: float = 1e-14
+    # It has also converged if a step lowers its value by less than this fraction.
+    idle: float = 1e-9
+    # Maximum number of steps for one weight of the penalty.
+    max_penalty_steps: int = 10
+    # Maximum number of lengths of one step.
+    max_halvings: int = 30
+    # Fraction of the step to the first collapse, as in the other Newton descents.
+    fraction: float = 0.9
+    # Diagonal shifts, tried in this order until the matrix is positive definite.
+    shifts: tuple[float, ...] = (0.0, 1e-12, 1e-8, 1e-4)
+    # Approximate number of free pixels in one matrix.
+    at_once: int = 20_000
+    # Distance in pixels around folded cells, and around patches whose border moves, that becomes free.
+    margin: int = 4
+    # Distance in pixels around folds in which displacements become harmonic; it grows by a half if folds remain.
+    near: int = 2
+    # Growth factor of the smoothing's standard deviation in pixels.
+    smoother: float = 1.2
+
+
+_TUNING = PatchTuning()
 
 
 @dataclass(frozen=True)
@@ -141,8 +153,8 @@ def descend_patches(
     ``min_jacobian`` at all corners of cells with free pixels. ``given`` (h, w) is the given map, and ``patch`` (h, w)
     the patch of each free pixel, from 1 on; 0 for fixed pixels.
     """
-    large = np.bincount(patch.ravel())[1:].max(initial=0) > _LARGE
-    for weight, width, steps in _WIDE_BARRIERS if large else _BARRIERS:
+    large = np.bincount(patch.ravel())[1:].max(initial=0) > _TUNING.large
+    for weight, width, steps in _TUNING.wide_barriers if large else _TUNING.barriers:
         _descend_batches(_Patches(grid, w, given, patch, ThinBarrier(min_jacobian, width)), weight, steps)
 
 
@@ -160,7 +172,7 @@ def _descend_batches(patches: _Patches, weight: float, steps: int) -> None:
     """Converge all patches for one weight of the energy, with at most so many steps."""
     size = np.bincount(patches.patch.ravel())
     size[0] = 0
-    batch = (np.cumsum(size) - size) // _AT_ONCE
+    batch = (np.cumsum(size) - size) // _TUNING.at_once
     # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never taken.
     with np.errstate(all="ignore"):
         for number in range(int(batch[-1]) + 1):
@@ -226,12 +238,14 @@ class _Batch:
         self.system.assemble(self.energy.curvature_of(deformation).scaled(np.full(self._count, share)))
         one = np.ones(self.free.size)
         self.system.add_blocks(one, 0 * one, one)
-        found = self.system.descent(gradient, _SHIFTS)
+        found = self.system.descent(gradient, _TUNING.shifts)
         direction = found[0] if found is not None else self.system.solve_diagonal(-gradient)
         fall = -(gradient.real * direction.real + gradient.imag * direction.imag)
         expected_decrease = np.bincount(self.of_pixel, fall, minlength=self.patches).astype(np.float64, copy=False)
         fallen = self._search(direction, expected_decrease, value, moving & (expected_decrease > 0) & (value < np.inf))
-        return (fallen > _IDLE * value) & (0.5 * expected_decrease > np.maximum(_TOLERANCE * value, _ZERO_DECREASE))
+        return (fallen > _TUNING.idle * value) & (
+            0.5 * expected_decrease > np.maximum(_TUNING.tolerance * value, _TUNING.zero_decrease)
+        )
 
     def _search(
         self, direction: ComplexArray, expected_decrease: FloatArray, before: FloatArray, moving: BoolArray
@@ -242,7 +256,7 @@ class _Batch:
         reach = np.full(self.patches, np.inf)
         if self.energy.energy.barrier:
             np.minimum.at(reach, self.of_triangle, self.energy.steps_to_collapse(self.here, full))
-        longest = np.where(moving, np.minimum(1, _FRACTION * reach), 0)
+        longest = np.where(moving, np.minimum(1, _TUNING.fraction * reach), 0)
         start, trial = self.here[self.free], self.here.copy()
 
         def values(t: FloatArray) -> FloatArray:
@@ -250,7 +264,7 @@ class _Batch:
             trial[self.free] = np.where(step > 0, start + step * direction, start)
             return self._values(trial)[0]
 
-        t, value = backtrack_each(values, before, expected_decrease, longest, tries=_MAX_HALVINGS)
+        t, value = backtrack_each(values, before, expected_decrease, longest, tries=_TUNING.max_halvings)
         self.here = trial
         return np.where(t > 0, before - value, 0)
 
@@ -276,7 +290,7 @@ def fill_patches(
     Return the map and the patch (h, w) of each free pixel, from 1 on; 0 for all others. Raise FixedPixelsError if no
     such map was found, which can only happen with fixed pixels.
     """
-    w, distance, penalties = given.copy(), _NEAR, list(_PENALTIES)
+    w, distance, penalties = given.copy(), _TUNING.near, list(_TUNING.penalties)
     free = grow(find_points(find_folds(grid, given, min_jacobian)), distance, fixed)
     if not free.all():
         _fill(grid, w, free)
@@ -286,13 +300,13 @@ def fill_patches(
     wrong = find_folds(grid, w, min_jacobian)
     if not wrong.any():
         return w, patch
-    free |= grow(find_points(wrong), _MARGIN, fixed)
+    free |= grow(find_points(wrong), _TUNING.margin, fixed)
     while not free.all():
         for weight in penalties:
             patch = label_patches(free)
             folded = np.isin(patch, np.unique(patch[find_points(wrong)]))
-            patches = _Patches(grid, w, given, np.where(folded, patch, 0), FoldPenalty(min_jacobian, _WIDTH))
-            _descend_batches(patches, weight, _MAX_PENALTY_STEPS)
+            patches = _Patches(grid, w, given, np.where(folded, patch, 0), FoldPenalty(min_jacobian, _TUNING.width))
+            _descend_batches(patches, weight, _TUNING.max_penalty_steps)
             free |= grow_pressing(w != given, patch, fixed)
             wrong = find_folds(grid, w, min_jacobian)
             if not wrong.any():
@@ -315,7 +329,7 @@ def fill_patches(
 def grow_pressing(moved: BoolArray, patch: IntArray, fixed: BoolArray) -> BoolArray:
     """Return the patches (h, w) in which pixels moved at the border, and pixels around them."""
     rim = moved & (patch > 0) & grow(patch == 0, 1, fixed)
-    return grow(np.isin(patch, np.unique(patch[rim])) & (patch > 0), _MARGIN, fixed)
+    return grow(np.isin(patch, np.unique(patch[rim])) & (patch > 0), _TUNING.margin, fixed)
 
 
 def _fill(grid: PixelGrid, w: ComplexArray, free: BoolArray) -> None:
@@ -356,5 +370,5 @@ def _smooth(grid: PixelGrid, given: ComplexArray, min_jacobian: float) -> Comple
         w: ComplexArray = grid.rest + smooth[0] + 1j * smooth[1]
         if not find_folds(grid, w, min_jacobian).any():
             return w
-        deviation *= _SMOOTHER
+        deviation *= _TUNING.smoother
     return grid.rest + moved.mean()

@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,19 +40,30 @@ from quasiharmonic.util.progress import heartbeat
 
 # Orders of the axes x, y, z, and the sign that makes the determinant of the steps positive at rest.
 _ORDERS = tuple((p, int(np.linalg.det(np.eye(3)[list(p)]).round())) for p in permutations(range(3)))
-# Distance in voxels around folded cells that becomes free; factor of it for patches that still fold; rounds.
-_MARGIN, _GROWTH, _MAX_ROUNDS = 2, 2, 5
-# Weights of the energy relative to the squared distance, in voxels.
-_WEIGHTS = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
-# Voxels closer than this to their original position, in voxels, return to it.
-_RETURN_DISTANCE = 1e-3
-# Floating-point determinants below this, relative to a bound of their terms, are decided exactly.
-_SURE = 2.0**-48
-_UNDERFLOW = 2.0**-1000
-# Determinants aimed at, relative to the bound.
-_AIM = 1.05
-# Candidates per block of the inversion.
-_BLOCK = 1 << 16
+
+
+class VoxelTuning(NamedTuple):
+    """Numbers that tune the untangling of voxels."""
+
+    # Distance in voxels around folded cells that becomes free; factor of it for patches that still fold; rounds.
+    margin: int = 2
+    growth: int = 2
+    max_rounds: int = 5
+    # Weights of the energy relative to the squared distance, in voxels.
+    weights: tuple[float, ...] = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
+    # Voxels closer than this to their original position, in voxels, return to it.
+    return_distance: float = 1e-3
+    # Floating-point determinants below this, relative to a bound of their terms and with a margin for underflow, are
+    # decided exactly.
+    sure: float = 2.0**-48
+    underflow: float = 2.0**-1000
+    # Determinants aimed at, relative to the bound.
+    aim: float = 1.05
+    # Candidates per block of the inversion.
+    block: int = 1 << 16
+
+
+_TUNING = VoxelTuning()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -243,7 +254,7 @@ def find_folded_cells(grid: VoxelGrid, field: FloatArray, min_jacobian: float | 
             else:
                 # Row sums bound the permanent, of which rounding is less than 2⁻⁴⁹; underflow loses less than the rest.
                 size = np.abs(a).sum(axis=0) * np.abs(b).sum(axis=0) * np.abs(c).sum(axis=0)
-                unsure |= ~(_SURE * size + _UNDERFLOW < D)
+                unsure |= ~(_TUNING.sure * size + _TUNING.underflow < D)
         if unsure.any():
             slices = VoxelGrid((2, *grid.shape[1:]), grid.spacing)
             T = slices.tetrahedra(slices.number_cells(unsure[None]))
@@ -285,10 +296,10 @@ def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArr
     """Change a field in place in patches around folded cells; patches that still fold grow."""
     from scipy.ndimage import find_objects
 
-    given, margin = field.copy(), _MARGIN
+    given, margin = field.copy(), _TUNING.margin
     free = grow(find_points(wrong), margin, fixed)
     todo = free
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(_TUNING.max_rounds):
         labels = label_patches(free)
         again = np.zeros(grid.shape, dtype=np.bool_)
         wanted = set(np.unique(labels[todo & free]).tolist()) - {0}
@@ -301,7 +312,7 @@ def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArr
                     again[around] |= mask
         if not again.any():
             return
-        margin *= _GROWTH
+        margin *= _TUNING.growth
         todo = grow(again, margin, fixed)
         if np.array_equal(todo | free, free):
             return
@@ -324,17 +335,17 @@ def _repair_patch(
     rest = (index - corner)[:, ::-1] * grid.spacing / unit
     before = rest + given[tuple(index.T)] / unit
     free = np.flatnonzero(mask[tuple(index.T)])
-    energy = ShapeEnergy(T, rest, floor=min(_AIM * min_jacobian + 1e-9, 0.99))
+    energy = ShapeEnergy(T, rest, floor=min(_TUNING.aim * min_jacobian + 1e-9, 0.99))
     descent = TetrahedraDescent(energy, free, before, anchor=(before, 1.0 / len(T)))
     with np.errstate(all="ignore"):
         if not descent.make_valid(max_steps=200):
             return False
-        for weight in _WEIGHTS:
+        for weight in _TUNING.weights:
             descent.anchor = before, 1.0 / (weight * len(T))
             for _ in descent.polish(max_steps=8, tol=1e-4):
                 pass
     X = descent.X
-    near = np.flatnonzero((np.abs(X - before) < _RETURN_DISTANCE).all(axis=1))
+    near = np.flatnonzero((np.abs(X - before) < _TUNING.return_distance).all(axis=1))
     back = X.copy()
     back[near] = before[near]
     if energy.determinants(back).min() > min_jacobian:
@@ -396,9 +407,9 @@ def _candidates(grid: VoxelGrid, X: FloatArray) -> Iterator[tuple[IntArray, IntA
     """Yield pairs of tetrahedra (k, 4) and voxels (k,) in their boxes, and the voxels' positions in voxels (k, 3)."""
     last = np.array(grid.shape[::-1]) - 1
     first = grid.number_cells(np.ones(grid.cell_shape, dtype=np.bool_))
-    for start in range(0, len(first), _BLOCK // 6):
+    for start in range(0, len(first), _TUNING.block // 6):
         heartbeat()
-        T = grid.tetrahedra(first[start : start + _BLOCK // 6])
+        T = grid.tetrahedra(first[start : start + _TUNING.block // 6])
         p = X[T]
         low = np.clip(np.ceil(p.min(axis=1) - 1e-9), 0, last + 1).astype(np.int64)
         high = np.clip(np.floor(p.max(axis=1) + 1e-9), -1, last).astype(np.int64)

@@ -25,9 +25,6 @@ from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, work
 
-# Weight of the barrier that keeps the boundary near its curves, relative to the energy; as in
-# `energies.newton.sliding_boundary`.
-_WEIGHT = 1e-2
 # Step for differences of the barrier's gradient, relative to the curve's length.
 _STEP = 1e-6
 
@@ -99,11 +96,14 @@ class SlidingFreedom(Freedom):
     def __init__(
         self, energy: DeformationEnergy, track: Track, domain: Domain, exponent: int, linear_solver: str
     ) -> None:
+        # Weight of the barrier that keeps the boundary near its curves, relative to the energy; as in
+        # `energies.newton.sliding_boundary`.
+        weight = 1e-2
         held = np.setdiff1d(domain.fixed, track.vertices)
         super().__init__(energy, len(track.uv), held, linear_solver, track.vertices)
         self._track, self._s, self._there = track, track.s, track.s
         self._deviation, self._unit = DeviationBarrier(track, domain.loops, exactly=True), 2.0**exponent
-        self._weight = _WEIGHT * energy.value(in_units(track.uv, exponent))
+        self._weight = weight * energy.value(in_units(track.uv, exponent))
         self._both = (self._deviation.pairs >= 0).all(axis=1)
         self.system.couple(self._deviation.pairs[self._both])
 

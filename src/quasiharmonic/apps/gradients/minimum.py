@@ -8,7 +8,7 @@ is not positive definite, only as much of the negative curvature of triangles is
 from __future__ import annotations
 
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,24 +23,31 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.util.arrays import ComplexArray, to_points
 from quasiharmonic.util.progress import heartbeat
 
-# Maximum number of steps.
-_MAX_STEPS = 100
-# If the matrix is not positive definite, these fractions of the triangles' negative curvature are removed in turn.
-_CLAMPED = 1 / 64, 1 / 16, 1 / 4, 1.0
-# Steps with a strain of at most this on every triangle count as zero.
-_ZERO_STRAIN = 1e-12
-# Exact steps below this that are more than half as long as the step before are limited by rounding.
-_ROUNDING_STRAIN = 1e-6
-# If the last step strains more than this, the map has not converged.
-_CONVERGED = 1e-6
-# After a step this short, second derivatives have the same leading digits, and are not factored again.
-_REUSE_STRAIN = 1e-8
-# Relative increase of the energy that counts as rounding.
-_ROUNDING = 1e-13
-# With a unit diagonal, an eigenvalue below this counts as zero.
-_SINGULAR = 1e-10
-# A triangle whose ratio of smaller to larger singular value is below this counts as nearly collapsed.
-_COLLAPSED_RATIO = 1e-8
+
+class MinimumTuning(NamedTuple):
+    """Numbers that tune the exact steps to a minimum."""
+
+    # Maximum number of steps.
+    max_steps: int = 100
+    # If the matrix is not positive definite, these fractions of the triangles' negative curvature are removed in turn.
+    clamped: tuple[float, ...] = (1 / 64, 1 / 16, 1 / 4, 1.0)
+    # Steps with a strain of at most this on every triangle count as zero.
+    zero_strain: float = 1e-12
+    # Exact steps below this that are more than half as long as the step before are limited by rounding.
+    rounding_strain: float = 1e-6
+    # If the last step strains more than this, the map has not converged.
+    converged: float = 1e-6
+    # After a step this short, second derivatives have the same leading digits, and are not factored again.
+    reuse_strain: float = 1e-8
+    # Relative increase of the energy that counts as rounding.
+    rounding: float = 1e-13
+    # With a unit diagonal, an eigenvalue below this counts as zero.
+    singular: float = 1e-10
+    # A triangle whose ratio of smaller to larger singular value is below this counts as nearly collapsed.
+    collapsed_ratio: float = 1e-8
+
+
+_TUNING = MinimumTuning()
 
 
 class Minimum:
@@ -66,7 +73,7 @@ class Minimum:
         self._clamped = 0.0
         self.doubts: list[Doubt] = []
         with np.errstate(all="ignore"):
-            left = self._converge(_MAX_STEPS if converge else 0)
+            left = self._converge(_TUNING.max_steps if converge else 0)
             d, density = self._deformation, energy.energy
             curvature = density.curvature(d, negative=1.0)
             corners = np.ascontiguousarray(energy.F.T)
@@ -95,11 +102,11 @@ class Minimum:
             heartbeat()
             step, self._exact = self._direction(self._evaluate())
             size = self._strain(step)
-            if size <= _ZERO_STRAIN or (self._exact and size <= _ROUNDING_STRAIN and size > 0.5 * last):
+            if size <= _TUNING.zero_strain or (self._exact and size <= _TUNING.rounding_strain and size > 0.5 * last):
                 return size
             if not steps or not self._take_step(step):
                 return size
-            if self._exact and size <= _REUSE_STRAIN:
+            if self._exact and size <= _TUNING.reuse_strain:
                 # Convergence is quadratic, so this was the last step, and the factor is accurate to the same number of
                 # digits.
                 self._evaluate()
@@ -116,7 +123,7 @@ class Minimum:
     def _direction(self, gradient: ComplexArray) -> tuple[ComplexArray, bool]:
         """Return Newton's step, and whether it uses the exact second derivatives."""
         system = self._freedom.system
-        for clamped in (0.0, *_CLAMPED):
+        for clamped in (0.0, *_TUNING.clamped):
             if 0 < clamped < self._clamped:
                 continue
             system.assemble(self._energy.curvature_of(self._deformation, negative=1.0 - clamped))
@@ -147,7 +154,7 @@ class Minimum:
             return value, there if accepted else None
 
         # Near the stationary point only rounding changes the energy, so no decrease is required.
-        taken = backtrack(evaluate_step, before + _ROUNDING * abs(before), 0.0, tries=40)
+        taken = backtrack(evaluate_step, before + _TUNING.rounding * abs(before), 0.0, tries=40)
         if taken is None:
             return False
         self.w = taken.state
@@ -189,12 +196,12 @@ class Minimum:
 
     def _record_doubts(self, left: float) -> None:
         """Record the doubts."""
-        if not left <= _CONVERGED:
+        if not left <= _TUNING.converged:
             self.doubts.append(Doubt.NOT_AT_REST)
-        if self._least_eigenvalue() < _SINGULAR:
+        if self._least_eigenvalue() < _TUNING.singular:
             self.doubts.append(Doubt.NEAR_SINGULAR)
         p, q = np.abs(self._deformation.p), np.abs(self._deformation.q)
-        if np.any(p - q < _COLLAPSED_RATIO * (p + q)):
+        if np.any(p - q < _TUNING.collapsed_ratio * (p + q)):
             self.doubts.append(Doubt.NEAR_COLLAPSE)
         if self._freedom.resting:
             self.doubts.append(Doubt.SLIDING)

@@ -39,9 +39,6 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 
-# Points per block, so that the arrays fit into the cache.
-_POINTS = 1 << 14
-
 #: The elements that values on a surface belong to.
 Per = Literal["vertex", "corner", "triangle"]
 
@@ -291,6 +288,8 @@ class InverseMap(ReadOnly):
         ValueError
             If a shape does not match, or ``at`` refers to a triangle out of range.
         """
+        # Points per block, so that the arrays fit into the cache.
+        points_per_block = 1 << 14
         check_choice("per", per, get_args(Per))
         given = real_array("values", values)
         expected = {"vertex": (len(self.V),), "corner": (len(self.F), 3), "triangle": (len(self.F),)}[per]
@@ -309,8 +308,8 @@ class InverseMap(ReadOnly):
             out[found] = given[t]
         else:
             barycentric = barycentric.reshape(-1, 3)
-            for start in range(0, t.size, _POINTS):
-                which, here = found[start : start + _POINTS], t[start : start + _POINTS]
+            for start in range(0, t.size, points_per_block):
+                which, here = found[start : start + points_per_block], t[start : start + points_per_block]
                 weights = barycentric[which].reshape(-1, 3, *(1,) * len(tail))
                 total = np.zeros((here.size, *tail))
                 for i in range(3):

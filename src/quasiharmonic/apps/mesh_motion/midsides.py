@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,20 +23,27 @@ from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.methods.untangling import untangle
 from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, invert_indices, to_complex, to_points
 
-# Required least control value of an inverted element, relative to that of the triangle of its corners.
-_MARGIN = 0.1
-# Weight of displacements in the first try; each further try has a tenth of it.
-_DISPLACEMENT_WEIGHT = 1e-2
-_MAX_TRIES = 8
-# Steps per try.
-_STEPS = 30
-# Attempts in order. First value: rings of elements around inverted ones whose nodes move; None moves only mid-side
-# nodes of inverted elements. Second value: initial positions, as a fraction of the way from ``straight`` to
-# ``searched``. Further attempts start from the best result.
-_ATTEMPTS = (None, 0.0), (0, 0.0), (1, 0.0), (3, 0.0), (3, 0.5), (3, 1.0)
-_FURTHER = 1, 2, 4, 8
-# Maximum number of untangling steps; successful runs need a few dozen.
-_CORNER_STEPS = 300
+
+class MidsideTuning(NamedTuple):
+    """Numbers that tune the tries for mid-side nodes."""
+
+    # Required least control value of an inverted element, relative to that of the triangle of its corners.
+    margin: float = 0.1
+    # Weight of displacements in the first try; each further try has a tenth of it.
+    displacement_weight: float = 1e-2
+    max_tries: int = 8
+    # Steps per try.
+    steps: int = 30
+    # Attempts in order. First value: rings of elements around inverted ones whose nodes move; None moves only mid-side
+    # nodes of inverted elements. Second value: initial positions, as a fraction of the way from ``straight`` to
+    # ``searched``. Further attempts start from the best result.
+    attempts: tuple[tuple[int | None, float], ...] = (None, 0.0), (0, 0.0), (1, 0.0), (3, 0.0), (3, 0.5), (3, 1.0)
+    further: tuple[int, ...] = (1, 2, 4, 8)
+    # Maximum number of untangling steps; successful runs need a few dozen.
+    corner_steps: int = 300
+
+
+_TUNING = MidsideTuning()
 
 
 def find_sides(F: IntArray) -> tuple[IntArray, IntArray]:
@@ -92,7 +100,7 @@ def untangle_elements(F: IntArray, straight: FloatArray, searched: FloatArray, f
     perhaps better ones. Some elements of the result may still be inverted.
     """
     best, bad = straight, inverted_elements(F, straight)
-    for rings, share in (*_ATTEMPTS, *((rings, None) for rings in _FURTHER)):
+    for rings, share in (*_TUNING.attempts, *((rings, None) for rings in _TUNING.further)):
         if not bad.size:
             break
         if share and searched is straight:
@@ -125,9 +133,9 @@ def _move_nodes(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
     near = F[np.isin(F, free).any(axis=1)]
     objective = _Displacement(near, points, free)
     now = points.copy()
-    weight = _DISPLACEMENT_WEIGHT
-    for _ in range(_MAX_TRIES):
-        for _ in range(_STEPS):
+    weight = _TUNING.displacement_weight
+    for _ in range(_TUNING.max_tries):
+        for _ in range(_TUNING.steps):
             step = objective.find_step(now, weight)
             if step is None:
                 break
@@ -162,7 +170,7 @@ class _Displacement:
     def _find_deficits(self, now: FloatArray) -> FloatArray:
         """Return how far control values are below the margin; (f, 6)."""
         x, y = (now[self._F] - now[self._F[:, :1]]).transpose(2, 0, 1)
-        return np.maximum(_MARGIN - jacobian_coefficients(x, y) / self._unit[:, None], 0.0)
+        return np.maximum(_TUNING.margin - jacobian_coefficients(x, y) / self._unit[:, None], 0.0)
 
     def _value(self, now: FloatArray, weight: float) -> float:
         return float(weight * (self._find_displacement(now) ** 2).sum() + (self._find_deficits(now) ** 2).sum())
@@ -219,7 +227,7 @@ def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
     rest = problem.V * np.sqrt(np.divide(*areas))
     for further in untangle(corners, w, problem.fixed, rest=rest, linear_solver=linear_solver):
         w, steps = further, steps + 1
-        if steps == _CORNER_STEPS:
+        if steps == _TUNING.corner_steps:
             break
     uv = np.ldexp(to_points(w), exponent)
     uv[problem.fixed] = problem.target

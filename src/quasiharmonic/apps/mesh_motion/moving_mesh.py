@@ -17,7 +17,7 @@ minimum or to the other way around a hole.
 
 from __future__ import annotations
 
-from typing import TypedDict, Unpack, overload
+from typing import NamedTuple, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,12 +53,19 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.options import MovingOptions, takes
 
-# Step as a fraction of the distance to the first collapse of a triangle.
-_FRACTION = 0.8
-# Minimum step, as a share of the remaining displacement.
-_MIN_STEP = 1e-4
-# Minimum decrease, relative to the energy, that a step must predict.
-_TOLERANCE = 1e-4
+
+class MotionTuning(NamedTuple):
+    """Numbers that tune the steps of a moving mesh."""
+
+    # Step as a fraction of the distance to the first collapse of a triangle.
+    fraction: float = 0.8
+    # Minimum step, as a share of the remaining displacement.
+    min_step: float = 1e-4
+    # Minimum decrease, relative to the energy, that a step must predict.
+    tolerance: float = 1e-4
+
+
+_TUNING = MotionTuning()
 
 
 class MovingDescent:
@@ -116,10 +123,10 @@ class MovingDescent:
             moved = coordinates.with_pinned(target if t == 1 else there)
             return 0.0, moved if is_injective(model.energy.F, moved.positions(w)) else None
 
-        longest = min(1.0, _FRACTION * float(model.energy.steps_to_collapse(start.w, displacement).min()))
-        if not longest >= _MIN_STEP:
+        longest = min(1.0, _TUNING.fraction * float(model.energy.steps_to_collapse(start.w, displacement).min()))
+        if not longest >= _TUNING.min_step:
             return 0.0
-        tries = 1 + int(np.log2(longest / _MIN_STEP))
+        tries = 1 + int(np.log2(longest / _TUNING.min_step))
         taken = backtrack(evaluate_step, 0.0, 0.0, longest=longest, tries=tries)
         if taken is None:
             return 0.0
@@ -290,7 +297,7 @@ class MovingMesh:
         try:
             # Overflow gives inf or NaN, and a step with either is never accepted.
             with np.errstate(all="ignore"):
-                share = self._descent.move(goal, _TOLERANCE, steps=25)
+                share = self._descent.move(goal, _TUNING.tolerance, steps=25)
             if share < 1:
                 raise RuntimeError(
                     f"the boundary can be moved only {share:.1%} of the way: then triangles become too small for such "
@@ -306,12 +313,12 @@ class MovingMesh:
         """Return the mesh after some steps down the energy."""
         with np.errstate(all="ignore"):
             if not self._slide:
-                for _ in self._descent.newton.descend(self._settle, _TOLERANCE):
+                for _ in self._descent.newton.descend(self._settle, _TUNING.tolerance):
                     pass
                 return self._descent.uv
             model = self._make_sliding_model(self._descent.uv)
             descent = NewtonDescent(model, model.start())
-            for _ in descent.descend(self._settle, _TOLERANCE):
+            for _ in descent.descend(self._settle, _TUNING.tolerance):
                 pass
         return model.positions(descent.w)
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,12 +33,19 @@ from quasiharmonic.solver.mapping import solve_problem
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, edge_names, mark, names_of
 from quasiharmonic.util.options import MapOptions, PolishOptions, RepairOptions
 
-# Numbers of rings of free vertices around inverted triangles, tried in turn.
-_RINGS = 1, 2, 3, 4, 6, 8, 12, 16, 24, 32
-# Maximum share of free vertices in the interior of the island.
-_MAX_SHARE = 0.5
-# Iterations on a patch other than the whole island.
-_PATCH_ITERATIONS = 100
+
+class IslandRepairTuning(NamedTuple):
+    """Numbers that tune the patches of an island."""
+
+    # Numbers of rings of free vertices around inverted triangles, tried in turn.
+    rings: tuple[int, ...] = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+    # Maximum share of free vertices in the interior of the island.
+    max_share: float = 0.5
+    # Iterations on a patch other than the whole island.
+    patch_iterations: int = 100
+
+
+_TUNING = IslandRepairTuning()
 
 
 class IslandRepair:
@@ -83,14 +91,14 @@ class IslandRepair:
         """Repair the island: first by patches, unless it is to be mapped as a whole, then as a whole."""
         tried: set[bytes] = set()
         whole = self._options.whole
-        for rings in () if whole else _RINGS:
+        for rings in () if whole else _TUNING.rings:
             free = self._find_near(self._find_repairable(), rings)
-            if not 0 < np.count_nonzero(free) <= _MAX_SHARE * np.count_nonzero(~self._fixed):
+            if not 0 < np.count_nonzero(free) <= _TUNING.max_share * np.count_nonzero(~self._fixed):
                 break
             for patch in self._components(free):
                 if patch.tobytes() not in tried:
                     tried.add(patch.tobytes())
-                    self._attempt(patch, _PATCH_ITERATIONS, keep=True)
+                    self._attempt(patch, _TUNING.patch_iterations, keep=True)
         if self._find_repairable().size:
             for part in self._components(~self._fixed):
                 if inverted_triangles(self._F[part[self._F].any(axis=1)], self.uv).size:

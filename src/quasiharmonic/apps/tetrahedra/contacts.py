@@ -284,7 +284,7 @@ def _find_line_crossings(boxes: _Boxes, line: _Line) -> list[tuple[int, int]] | 
     """Crossings of a line; None if it meets an edge of a triangle."""
     (corners, lo, hi), (triangle, weights, axes) = boxes, line
     total = sum(weights)
-    own = _rational(corners[triangle])
+    own = _to_fractions(corners[triangle])
     q = [sum(w * p[a] for w, p in zip(weights, own, strict=True)) / total for a in axes[:2]]
     near = np.ones(len(corners), dtype=np.bool_)
     for value, a in zip(q, axes[:2], strict=True):
@@ -292,7 +292,7 @@ def _find_line_crossings(boxes: _Boxes, line: _Line) -> list[tuple[int, int]] | 
         near &= (lo[:, a] <= above) & (hi[:, a] >= below)
     found = []
     for k in np.flatnonzero(near).tolist():
-        p = _rational(corners[k])
+        p = _to_fractions(corners[k])
         flat = [(point[axes[0]] - q[0], point[axes[1]] - q[1]) for point in p]
         areas = [flat[i][0] * flat[j][1] - flat[i][1] * flat[j][0] for i, j in ((1, 2), (2, 0), (0, 1))]
         if all(area > 0 for area in areas) or all(area < 0 for area in areas):
@@ -309,5 +309,5 @@ def _find_line_crossings(boxes: _Boxes, line: _Line) -> list[tuple[int, int]] | 
     return result
 
 
-def _rational(points: FloatArray) -> list[list[Fraction]]:
+def _to_fractions(points: FloatArray) -> list[list[Fraction]]:
     return [[Fraction(value) for value in point] for point in points.tolist()]

@@ -36,18 +36,27 @@ from quasiharmonic.util.progress import heartbeat
 if TYPE_CHECKING:
     from scipy.sparse import bsr_array
 
-# Share of the volume term in the density.
-_VOLUME_SHARE = 0.5
+
+class VolumeDescentTuning(NamedTuple):
+    """Numbers that tune the descent of the volume energy."""
+
+    # Share of the volume term in the density.
+    volume_share: float = 0.5
+    # Relative residual of the linear systems, and maximum number of iterations.
+    residual: float = 0.05
+    max_conjugate_steps: int = 250
+    # The regularisation parameter is kept after a step that lowers the energy by more than this share, but not more
+    # often.
+    quick_decrease: float = 0.1
+    max_repeated: int = 10
+    # Least regularisation parameter; determinants are about 1.
+    min_epsilon: float = 1e-14
+
+
+_TUNING = VolumeDescentTuning()
+
 # Pairs of vertices of a tetrahedron whose blocks are computed; the others are their transposes.
 _PAIRS = tuple((i, j) for i in range(4) for j in range(i, 4))
-# Relative residual of the linear systems, and maximum number of iterations.
-_RESIDUAL = 0.05
-_MAX_CONJUGATE_STEPS = 250
-# The regularisation parameter is kept after a step that lowers the energy by more than this share, but not more often.
-_QUICK_DECREASE = 0.1
-_MAX_REPEATED = 10
-# Least regularisation parameter; determinants are about 1.
-_MIN_EPSILON = 1e-14
 
 
 class _Density(NamedTuple):
@@ -127,7 +136,7 @@ class ShapeEnergy:
             return np.inf
         chi = regularise(D - self.floor, epsilon)
         t = np.einsum("abt,abt->t", J, J)
-        density = (1 - _VOLUME_SHARE) / 3 * t * np.cbrt(chi) ** -2 + _VOLUME_SHARE / 2 * (D * D + 1) / chi
+        density = (1 - _TUNING.volume_share) / 3 * t * np.cbrt(chi) ** -2 + _TUNING.volume_share / 2 * (D * D + 1) / chi
         value = float(density.mean())
         return value if np.isfinite(value) else np.inf
 
@@ -142,7 +151,7 @@ class ShapeEnergy:
         t = np.einsum("abt,abt->t", J, J)
         chi = regularise(D - self.floor, epsilon)
         root = np.hypot(D - self.floor, epsilon)
-        a, b = (1 - _VOLUME_SHARE) / 3, _VOLUME_SHARE / 2
+        a, b = (1 - _TUNING.volume_share) / 3, _TUNING.volume_share / 2
         shape = a * np.cbrt(chi) ** -2
         g = b * (D * D + 1) / chi
         # First and second derivative of χ, relative to χ.
@@ -272,13 +281,13 @@ class TetrahedraDescent:
             after = self._step(epsilon)
             least = float(self.energy.determinants(self.X).min()) - self.energy.floor
             yield least
-            if least > 0 or (after is None and epsilon < _MIN_EPSILON):
+            if least > 0 or (after is None and epsilon < _TUNING.min_epsilon):
                 return
             ratio = 1.0 if after is None else after / before
             # While the energy falls quickly, keep the parameter. Lowering it too early leads to worse local minima.
             repeated += 1
-            if ratio > 1.0 - _QUICK_DECREASE or repeated > _MAX_REPEATED:
-                epsilon, repeated = max(reduce_epsilon(epsilon, least, ratio), _MIN_EPSILON), 0
+            if ratio > 1.0 - _TUNING.quick_decrease or repeated > _TUNING.max_repeated:
+                epsilon, repeated = max(reduce_epsilon(epsilon, least, ratio), _TUNING.min_epsilon), 0
 
     def make_valid(self, max_steps: int) -> bool:
         """Untangle the mesh if necessary; return whether all determinants are above the floor."""
@@ -361,8 +370,8 @@ class TetrahedraDescent:
         z = project(self.projections, np.einsum("iab,ib->ia", inverse, r.reshape(-1, 3))).ravel()
         p, rz = z.copy(), float(r @ z)
         first = rz
-        for _ in range(_MAX_CONJUGATE_STEPS):
-            if not rz > _RESIDUAL**2 * first:
+        for _ in range(_TUNING.max_conjugate_steps):
+            if not rz > _TUNING.residual**2 * first:
                 break
             Ap = project(self.projections, (matrix @ p).reshape(-1, 3)).ravel()
             curvature = float(p @ Ap)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +29,22 @@ from quasiharmonic.util.progress import heartbeat
 
 SignArray = NDArray[np.int8]
 
-# |computed − exact| ≤ (7u + O(u²)) permanent, u = 2⁻⁵³ [1]_; 8u covers the rounding of the permanent.
-_RELATIVE_BOUND = 2.0**-50
-# Coordinates are at most one after scaling, so underflow changes the determinant by less than this.
-_UNDERFLOW_BOUND = 2.0**-1060
-# Stage 3 takes differences that are 0 or at least this, so that no product underflows.
-_MIN_DIFFERENCE = 2.0**-200
-# Tetrahedra per block, so that the data stay in the cache.
-_CHUNK = 1 << 14
+
+class VolumeBounds(NamedTuple):
+    """Bounds of rounding errors of a determinant."""
+
+    # |computed − exact| ≤ (7u + O(u²)) permanent, u = 2⁻⁵³ [1]_; 8u covers the rounding of the permanent.
+    relative: float = 2.0**-50
+    # Coordinates are at most one after scaling, so underflow changes the determinant by less than this.
+    underflow: float = 2.0**-1060
+    # Stage 3 takes differences that are 0 or at least this, so that no product underflows.
+    min_difference: float = 2.0**-200
+    # Tetrahedra per block, so that the data stay in the cache.
+    chunk: int = 1 << 14
+
+
+_BOUNDS = VolumeBounds()
+
 # Each corner with its three neighbours, right-handed, in the order of Gmsh and VTK.
 _CORNERS = np.array(
     [(0, 1, 3, 4), (1, 2, 0, 5), (2, 3, 1, 6), (3, 0, 2, 7), (4, 7, 5, 0), (5, 4, 6, 1), (6, 5, 7, 2), (7, 6, 4, 3)]
@@ -45,8 +54,6 @@ FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
 #: Edges of a tetrahedron.
 EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 _EDGES_OF_TRIANGLE = np.array([(0, 1), (1, 2), (2, 0)])
-# Vertex counts up to this have three vertices in one integer.
-_MAX_PACKED = 1 << 21
 
 
 class ExactSigns:
@@ -67,18 +74,18 @@ class ExactSigns:
     def __call__(self, corners: IntArray) -> SignArray:
         sign = np.empty(len(corners), dtype=np.int8)
         with np.errstate(under="ignore"):
-            for start in range(0, len(corners), _CHUNK):
+            for start in range(0, len(corners), _BOUNDS.chunk):
                 heartbeat()
-                block = slice(start, start + _CHUNK)
+                block = slice(start, start + _BOUNDS.chunk)
                 sign[block] = _sign_if_certain(self._edges(corners[block].T))
             undecided = np.flatnonzero(sign == 0)
             if not self.finite.all():
                 finite = np.asarray(self.finite[corners].all(axis=1))
                 sign[~finite] = 0
                 undecided = undecided[finite[undecided]]
-            for start in range(0, undecided.size, _CHUNK):
+            for start in range(0, undecided.size, _BOUNDS.chunk):
                 heartbeat()
-                chunk = undecided[start : start + _CHUNK]
+                chunk = undecided[start : start + _BOUNDS.chunk]
                 sign[chunk] = _decide(self._X[corners[chunk]])
         return sign
 
@@ -108,8 +115,8 @@ def _sign_if_certain(edges: Sequence[FloatArray]) -> SignArray:
         left += np.abs(right, out=right)
         left *= np.abs(a)
         permanent += left
-    permanent *= _RELATIVE_BOUND
-    permanent += _UNDERFLOW_BOUND
+    permanent *= _BOUNDS.relative
+    permanent += _BOUNDS.underflow
     sign = np.asarray(det > permanent).view(np.int8)
     sign -= np.asarray(det < -permanent).view(np.int8)
     return sign
@@ -128,7 +135,7 @@ def _decide(p: FloatArray) -> SignArray:
         for j in range(i):
             same |= (p[:, i] == p[:, j]).all(axis=1)
     open_ = (sign == 0) & ~same
-    small = (np.abs(difference) < _MIN_DIFFERENCE) & (difference != 0)
+    small = (np.abs(difference) < _BOUNDS.min_difference) & (difference != 0)
     summable = ROUNDS_ONCE & exact & ~(tail != 0).any(axis=(1, 2)) & ~small.any(axis=(1, 2))
     some = np.flatnonzero(open_ & summable)
     if some.size:
@@ -226,9 +233,11 @@ def _sort_triples(faces: IntArray) -> tuple[IntArray, IntArray]:
 
 def _group(rows: IntArray, n: int) -> tuple[IntArray, IntArray]:
     """Return an order in which equal rows of vertices are adjacent, and the start of each group of equal rows."""
+    # Vertex counts up to this have three vertices in one integer.
+    max_packed = 1 << 21
     if not len(rows):
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-    if n <= _MAX_PACKED:
+    if n <= max_packed:
         key = rows[:, 0]
         for column in rows.T[1:]:
             key = key * n + column

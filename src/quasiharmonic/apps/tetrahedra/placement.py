@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,14 +39,21 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.options import TetrahedraOptions
 
-# Largest distance of a vertex from a plane, relative to the extent of the mesh.
-_TOLERANCE = 1e-6
-# Least cosine between a triangle on a named plane and this plane.
-_PARALLEL = 0.9
-# Maximum number of crossing pairs of boundary triangles that are listed.
-_MAX_LISTED = 20
-# Newton steps without progress after which untangling has stalled.
-_PATIENCE = 100
+
+class PlacementTuning(NamedTuple):
+    """Numbers that tune the placement of the boundary."""
+
+    # Largest distance of a vertex from a plane, relative to the extent of the mesh.
+    tolerance: float = 1e-6
+    # Least cosine between a triangle on a named plane and this plane.
+    parallel: float = 0.9
+    # Maximum number of crossing pairs of boundary triangles that are listed.
+    max_listed: int = 20
+    # Newton steps without progress after which untangling has stalled.
+    patience: int = 100
+
+
+_TUNING = PlacementTuning()
 
 
 @dataclass(frozen=True)
@@ -104,7 +112,7 @@ def find_sliding(F: IntArray, X: FloatArray, moved: IntArray, slide: bool | Arra
         np.add.at(squares, corner[inside], leaning[inside, :, None] * leaning[inside, None, :])
     values, directions = np.linalg.eigh(squares)
     # Directions across which no triangle leans.
-    directions *= (values < (_TOLERANCE + rounding) ** 2)[:, None, :]
+    directions *= (values < (_TUNING.tolerance + rounding) ** 2)[:, None, :]
     free = directions.any(axis=(1, 2)) & (values[:, -1] > 0)
     directions = directions[free]
     return Sliding(vertices[free], directions @ directions.transpose(0, 2, 1))
@@ -140,8 +148,8 @@ def _snap_to_planes(
         height = P @ normal
         distance = height - (plane[3] / size / length - centre @ normal) / extent
         # Of a thin body only one side lies on the plane.
-        near = np.abs(distance) <= _TOLERANCE * np.ptp(height[F]) + rounding
-        parallel = (np.abs(normals @ normal) > _PARALLEL) | ~normals.any(axis=1)
+        near = np.abs(distance) <= _TUNING.tolerance * np.ptp(height[F]) + rounding
+        parallel = (np.abs(normals @ normal) > _TUNING.parallel) | ~normals.any(axis=1)
         on = near[F].all(axis=1) & parallel
         if not on.any():
             raise ValueError(f"slide has plane {k}, {plane.tolist()}, but no boundary triangle lies on it")
@@ -271,7 +279,7 @@ def _find_crossings(mesh: RestMesh, X: FloatArray, fixed: IntArray) -> tuple[Tet
         TetrahedraObstruction(
             f"The boundary triangles {tuple(one)} and {tuple(other)} meet{rest if not k else ''}.", (*one, *other)
         )
-        for k, (one, other) in enumerate(pairs[:_MAX_LISTED].tolist())
+        for k, (one, other) in enumerate(pairs[: _TUNING.max_listed].tolist())
     )
 
 
@@ -376,7 +384,7 @@ def _untangle(
         if count < best[-1][0]:
             best[:] = [(count, descent.X)]
         run.record(count, np.inf)
-        if since >= _PATIENCE:
+        if since >= _TUNING.patience:
             break
     return energy.count_inverted(descent.X)
 

@@ -21,9 +21,6 @@ from quasiharmonic.util.arrays import (
     reject,
 )
 
-# Minimum number of cells along the shorter side, so that vertices can move between landmarks and the border.
-_MIN_CELLS = 6
-
 #: A polyline (a, 2), a ≥ 2, and its target polyline (b, 2).
 CurvePair = tuple[ArrayLike, ArrayLike]
 
@@ -172,11 +169,13 @@ def _border_distance(border: FloatArray, size: IntArray) -> FloatArray:
 
 def make_image_mesh(landmarks: FloatArray, width: int, height: int, along: int) -> tuple[FloatArray, IntArray]:
     """Triangulate a grid of ``along`` cells per longer side, without points near landmarks; landmarks come last."""
+    # Minimum number of cells along the shorter side, so that vertices can move between landmarks and the border.
+    min_cells = 6
     from scipy.spatial import Delaunay, cKDTree
 
     spacing = max(width - 1, height - 1) / along
     size = (width - 1, height - 1)
-    x, y = (np.linspace(0, side, max(_MIN_CELLS, round(side / spacing)) + 1) for side in size)
+    x, y = (np.linspace(0, side, max(min_cells, round(side / spacing)) + 1) for side in size)
     grid = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
     sides, landmark_sides = ((p == 0) | (p == size) for p in (grid, landmarks))
     near = np.zeros(len(grid), dtype=bool)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
-from quasiharmonic.linsolve.pattern import stiffness_pattern
+from quasiharmonic.linsolve.laplacian import stiffness_pattern
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, list_others, repeat_each, work
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.progress import heartbeat

@@ -39,10 +39,22 @@ from quasiharmonic.util.progress import heartbeat
 
 #: Maximum number of neighbours of a vertex to remove.
 MOST_NEIGHBOURS = 8
-# Number of passes that choose the vertices of a round.
-_PASSES = 3
-# Weight of each neighbour in the order of removal, relative to a random number in [0, 1].
-_PER_NEIGHBOUR = 0.35
+
+
+class RemovalTuning(NamedTuple):
+    """Numbers that tune the rounds of removals. The C kernel has the same values of the first two."""
+
+    # Number of passes that choose the vertices of a round.
+    passes: int = 3
+    # Weight of each neighbour in the order of removal, relative to a random number in [0, 1].
+    per_neighbour: float = 0.35
+    # A round that can remove only this fraction of the vertices is not carried out.
+    min_fraction: float = 0.04
+    # If fewer than this fraction of the vertices in the arrays remain, the arrays are compacted.
+    compact_below: float = 0.7
+
+
+_TUNING = RemovalTuning()
 
 
 def allocate_round(T: IntArray) -> tuple[IntArray, IntArray, IntArray]:
@@ -121,11 +133,13 @@ def split_by_degree(rings: IntArray, of_degree: IntArray) -> Iterator[IntArray]:
 
 def _choose_independent(T: IntArray, free: BoolArray, degree: IntArray, random_order: FloatArray) -> BoolArray:
     """Choose free vertices of few neighbours, no two of them neighbours; (n,) bool."""
-    order = np.where(free & (degree > 0) & (degree <= MOST_NEIGHBOURS), random_order + _PER_NEIGHBOUR * degree, np.inf)
+    order = np.where(
+        free & (degree > 0) & (degree <= MOST_NEIGHBOURS), random_order + _TUNING.per_neighbour * degree, np.inf
+    )
     chosen = np.zeros(order.size, dtype=bool)
     # Choose every vertex that comes first in all its triangles. Further passes use the triangles without a chosen
     # corner and exclude the neighbours of chosen vertices. They add about half as many vertices.
-    for _ in range(_PASSES):
+    for _ in range(_TUNING.passes):
         first, earliest = T[0], order.take(T[0])
         for corner in T[1:]:
             at = order.take(corner)
@@ -214,12 +228,6 @@ def _adds_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[Boo
     return np.split(good, np.cumsum(size)[:-1])
 
 
-# A round that can remove only this fraction of the vertices is not carried out.
-_MIN_FRACTION = 0.04
-# If fewer than this fraction of the vertices in the arrays remain, the arrays are compacted.
-_COMPACT_BELOW = 0.7
-
-
 class Removal(NamedTuple):
     """Vertices (r,) int64 of one degree that are removed together, no two of them neighbours.
 
@@ -266,14 +274,14 @@ def coarsen(F: IntArray, n: int, fixed: BoolArray, goal: int) -> Coarsening:
     left, halved = n, 2 * n
     while left > goal:
         heartbeat()
-        if left < _COMPACT_BELOW * len(names):
+        if left < _TUNING.compact_below * len(names):
             # Renumber the remaining vertices in the same order.
             T = (np.cumsum(remains) - 1).take(T)
             names, free, random_order, remains = names[remains], free[remains], random_order[remains], remains[remains]
         vertices, rings, of_degree = allocate_round(T)
         remove_vertices(T, free, random_order, vertices, rings, of_degree)
         removed = int(of_degree.sum())
-        if removed < _MIN_FRACTION * left:
+        if removed < _TUNING.min_fraction * left:
             break
         if 2 * left <= halved:
             levels[len(rounds)], halved = names[T].T if rounds else F, left

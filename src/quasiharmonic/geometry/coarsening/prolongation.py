@@ -7,6 +7,8 @@ rounding.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from quasiharmonic.geometry.coarsening.levels import Coarsening
@@ -14,16 +16,23 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.progress import heartbeat
 
-# The sum of the squared sides of a triangle over twice its area is 2√3 ≈ 3.5 if it is equilateral. A vertex whose
-# triangles have a mean below this limit has a good position.
-_GOOD = 8.0
-# Other positions to try: fractions of the way from the apex to the centre of the ring, and distances from the apex into
-# the ring, in units of the distance to the nearest side. The second row is tried if none of the first is valid. Its
-# last position is always valid up to rounding.
-_TOWARDS_MIDDLE = ((0.75, 0.5), (0.25, 0.1))
-_INWARDS = ((2.0, 1.0, 0.5), (8.0, 4.0, 0.25))
-# Rings per block, so that the data stay in the cache.
-_RINGS_PER_BLOCK = 1024
+
+class ProlongationTuning(NamedTuple):
+    """Positions to try for a vertex in its ring. The C kernel has the same values of the first three."""
+
+    # The sum of the squared sides of a triangle over twice its area is 2√3 ≈ 3.5 if it is equilateral. A vertex whose
+    # triangles have a mean below this limit has a good position.
+    good: float = 8.0
+    # Other positions to try: fractions of the way from the apex to the centre of the ring, and distances from the apex
+    # into the ring, in units of the distance to the nearest side. The second row is tried if none of the first is
+    # valid. Its last position is always valid up to rounding.
+    towards_middle: tuple[tuple[float, ...], ...] = ((0.75, 0.5), (0.25, 0.1))
+    inwards: tuple[tuple[float, ...], ...] = ((2.0, 1.0, 0.5), (8.0, 4.0, 0.25))
+    # Rings per block, so that the data stay in the cache.
+    rings_per_block: int = 1024
+
+
+_TUNING = ProlongationTuning()
 
 
 def prolong(w: ComplexArray, coarsening: Coarsening, fixed: BoolArray) -> ComplexArray:
@@ -53,20 +62,21 @@ def reinsertion_positions(ring: ComplexArray) -> ComplexArray:
 def find_places(ring: ComplexArray, position: ComplexArray) -> None:
     """Fill in the position (r,) of a vertex in each ring (r, d), the apex first."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for start in range(0, len(ring), _RINGS_PER_BLOCK):
-            block = ring[start : start + _RINGS_PER_BLOCK]
+        for start in range(0, len(ring), _TUNING.rings_per_block):
+            part = slice(start, start + _TUNING.rings_per_block)
+            block = ring[part]
             # Transpose to corner by corner, because rows are too short for fast NumPy operations. Use real numbers,
             # because products of complex numbers are not rounded the same way on all platforms.
             corners = np.ascontiguousarray(block.view(np.float64).reshape(*block.shape, 2).transpose(1, 2, 0))
-            position.view(np.float64).reshape(-1, 2)[start : start + _RINGS_PER_BLOCK] = _best_positions(corners).T
+            position.view(np.float64).reshape(-1, 2)[part] = _best_positions(corners).T
 
 
 def _best_positions(ring: FloatArray) -> FloatArray:
     """Positions for rings (d, 2, r), the apex first; (2, r)."""
     position = _sum_in_order(ring) / len(ring)
     shape = _shape(position[None], ring)[0]
-    poor = np.flatnonzero(~(shape < _GOOD * len(ring)))
-    for towards, inwards in zip(_TOWARDS_MIDDLE, _INWARDS, strict=True):
+    poor = np.flatnonzero(~(shape < _TUNING.good * len(ring)))
+    for towards, inwards in zip(_TUNING.towards_middle, _TUNING.inwards, strict=True):
         if not poor.size:
             break
         around = ring.take(poor, axis=2)

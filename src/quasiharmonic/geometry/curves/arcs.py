@@ -15,16 +15,25 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_
 
 # Longest arc in radians, so that a few nodes integrate its length to rounding.
 _MAX_ARC = np.pi / 4
-# Turn of a curve along one chord, in radians.
-_FLAT = 0.1
+
+
+class ArcTuning(NamedTuple):
+    """Numbers that tune lengths and distances on curves."""
+
+    # Turn of a curve along one chord, in radians.
+    flat: float = 0.1
+    # A zero of the derivative is interior if its parameter differs by at least this value from both ends.
+    inside: float = 1e-6
+    # Nodes of Gauss' formula for a length.
+    nodes: int = 16
+    # Number of distances between points and segments computed together.
+    pairs: int = 1 << 20
+
+
+_TUNING = ArcTuning()
+
 #: A derivative below this value, relative to the curve's size, counts as zero.
 ZERO_DERIVATIVE = 1e-9
-# A zero of the derivative is interior if its parameter differs by at least this value from both ends.
-_INSIDE = 1e-6
-# Nodes of Gauss' formula for a length.
-_NODES = 16
-# Number of distances between points and segments computed together.
-_PAIRS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +138,7 @@ def _cusps(control: FloatArray) -> list[float]:
         third = points[3] - points[0] + 3 * (points[1] - points[2])
         by_power = [points[1] - points[0], 2 * (points[0] - 2 * points[1] + points[2]), third]
     roots = np.roots(by_power[::-1]).real
-    inner = np.unique(roots[(roots > _INSIDE) & (roots < 1 - _INSIDE)])
+    inner = np.unique(roots[(roots > _TUNING.inside) & (roots < 1 - _TUNING.inside)])
     speed = np.abs(np.polynomial.polynomial.polyval(inner, by_power))
     return [float(t) for t in inner[speed <= ZERO_DERIVATIVE * np.abs(points).max()]]
 
@@ -150,12 +159,12 @@ def count_chords(degree: int, control: ComplexArray, angles: FloatArray) -> int:
     if degree == 1:
         return 1
     if degree == 0:
-        return int(max(1, np.ceil(abs(angles[1] - angles[0]) / _FLAT)))
+        return int(max(1, np.ceil(abs(angles[1] - angles[0]) / _TUNING.flat)))
     sides = np.diff(control[: degree + 1])
     sides = sides[sides != 0]
     bends = np.abs(np.angle(sides[1:] / sides[:-1])).sum()
     # Use more chords for Bézier curves, because the turn is not spread evenly over the parameter.
-    return int(max(4, 2 * np.ceil(bends / _FLAT)))
+    return int(max(4, 2 * np.ceil(bends / _TUNING.flat)))
 
 
 def subcurve(control: FloatArray, t: float, u: float) -> FloatArray:
@@ -189,7 +198,7 @@ def nearest_on_segments(points: FloatArray, tails: FloatArray, heads: FloatArray
 def nearest_segment(points: FloatArray, tails: FloatArray, heads: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return the segment (k, 2) nearest to each point (m, 2), and where on it, as a share of its length; (m,) each."""
     nearest, share = np.empty(len(points), dtype=np.int64), np.empty(len(points))
-    portion = max(1, _PAIRS // len(tails))
+    portion = max(1, _TUNING.pairs // len(tails))
     for start in range(0, len(points), portion):
         part = slice(start, start + portion)
         shares, distance = nearest_on_segments(points[part, None], tails, heads)
@@ -235,5 +244,5 @@ def on_ellipse(control: FloatArray, angle: FloatArray) -> FloatArray:
 @cache
 def gauss_rule() -> tuple[FloatArray, FloatArray]:
     """Nodes and weights of Gauss' formula on [0, 1]."""
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes, weights = np.polynomial.legendre.leggauss(_TUNING.nodes)
     return (nodes + 1) / 2, weights / 2

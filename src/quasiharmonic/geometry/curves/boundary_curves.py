@@ -25,9 +25,6 @@ from quasiharmonic.util.arrays import (
     vertex_names,
 )
 
-# Relative to the largest coordinate: a vertex this close to its position on the curve is not moved.
-_SAME_POSITION = 2.0**-51
-
 
 def check_corner_angle(angle: float) -> None:
     """Raise a ValueError unless the turning angle of corners is from 0 to 180 degrees."""
@@ -114,17 +111,17 @@ class BoundaryCurves:
         on = {int(v): k for k, loop in enumerate(loops) for v in loop}
         return cls([uv[loop] for loop in loops], on=on, fixed=fixed)
 
-    def holding(self, vertices: IntArray) -> BoundaryCurves:
+    def fix_if_not_sliding(self, vertices: IntArray) -> BoundaryCurves:
         """Return a copy with more fixed vertices, except those in ``on``."""
         return self._copy_with(
             self.on, np.union1d(self.fixed, np.setdiff1d(vertices, index_array("on", list(self.on))))
         )
 
-    def keeping(self, vertices: IntArray) -> BoundaryCurves:
+    def with_fixed(self, vertices: IntArray) -> BoundaryCurves:
         """Return a copy with more fixed vertices, also such that are in ``on``."""
         return self._copy_with(self.on, np.union1d(self.fixed, vertices))
 
-    def among(self, used: IntArray) -> BoundaryCurves:
+    def restrict(self, used: IntArray) -> BoundaryCurves:
         """Return a copy for a submesh with the given vertices, ascending."""
         known = np.concatenate([index_array("on", list(self.on)), self.fixed])
         absent = np.setdiff1d(known, used)
@@ -172,7 +169,7 @@ class BoundaryCurves:
             chains.append(chain)
         return Track(chains, positions)
 
-    def off(self, loops: Sequence[IntArray], uv: FloatArray) -> IntArray:
+    def find_off_curves(self, loops: Sequence[IntArray], uv: FloatArray) -> IntArray:
         """Boundary vertices that are on no curve and are fixed; checks the vertices in ``on`` as `lay` does."""
         boundary, curve, _ = self._assign_curves(loops, uv)
         return np.setdiff1d(np.concatenate(loops), boundary[curve >= 0])
@@ -317,7 +314,9 @@ class Track:
 
 def _move_vertices(positions: FloatArray, vertices: IntArray, there: FloatArray) -> None:
     """Move vertices to their positions, except those that are there up to rounding."""
-    off = np.abs(positions[vertices] - there) > _SAME_POSITION * np.abs(there).max(initial=0)
+    # Relative to the largest coordinate: a vertex this close to its position on the curve is not moved.
+    same_position = 2.0**-51
+    off = np.abs(positions[vertices] - there) > same_position * np.abs(there).max(initial=0)
     is_moved = off.any(axis=1)
     positions[vertices[is_moved]] = there[is_moved]
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,28 +37,35 @@ from quasiharmonic.util.arrays import (
     to_points,
 )
 
-# Squares, and products of four numbers, of coordinates below this do not overflow
-_MAX_SIZE = 1e75
-# and above this do not underflow.
-_MIN_SIZE = 1e-75
-# Ends closer than this fraction of the curve's size are connected.
-_GAP = 1e-9
-# Smaller turns, in radians, are ignored: their effect on an optimisation is below its tolerance.
-_KINK = 1e-3
-# Step in the parameter of the chord that gives the direction of a piece where its derivative is zero.
-_CHORD = 1e-5
-# Lengths below this fraction of the curve's size count as rounding.
-_ROUNDING = 1e-13
-# Number of parameters of each piece in the table of lengths.
-_TABLE_SIZE = 32
-# Distance in the parameter from an end of a piece at which the search near that end starts.
-_INNER_START = 1e-2
-# A search for a parameter has converged if the parameter changes by at most this.
-_CONVERGED = 1e-15
-# Maximum number of steps of the search for a parameter by length.
-_LENGTH_STEPS = 60
-# Maximum number of steps of the search for a parameter by distance.
-_DISTANCE_STEPS = 40
+
+class CurveTolerances(NamedTuple):
+    """Tolerances of curves, and sizes of the searches for a parameter."""
+
+    # Squares, and products of four numbers, of coordinates below this do not overflow.
+    max_size: float = 1e75
+    # Above this they do not underflow.
+    min_size: float = 1e-75
+    # Ends closer than this fraction of the curve's size are connected.
+    gap: float = 1e-9
+    # Smaller turns, in radians, are ignored: their effect on an optimisation is below its tolerance.
+    kink: float = 1e-3
+    # Step in the parameter of the chord that gives the direction of a piece where its derivative is zero.
+    chord: float = 1e-5
+    # Lengths below this fraction of the curve's size count as rounding.
+    rounding: float = 1e-13
+    # Number of parameters of each piece in the table of lengths.
+    table_size: int = 32
+    # Distance in the parameter from an end of a piece at which the search near that end starts.
+    inner_start: float = 1e-2
+    # A search for a parameter has converged if the parameter changes by at most this.
+    converged: float = 1e-15
+    # Maximum number of steps of the search for a parameter by length.
+    length_steps: int = 60
+    # Maximum number of steps of the search for a parameter by distance.
+    distance_steps: int = 40
+
+
+_TOLERANCES = CurveTolerances()
 
 
 class Curve:
@@ -264,7 +272,9 @@ class Curve:
         for other in (0, -1, 1):
             candidate = here + other
             candidate = candidate % self._degree.size if self.closed else np.clip(candidate, 0, self._degree.size - 1)
-            begin = np.where(candidate == here, at, _INNER_START if other > 0 else 1 - _INNER_START)
+            begin = np.where(
+                candidate == here, at, _TOLERANCES.inner_start if other > 0 else 1 - _TOLERANCES.inner_start
+            )
             found, offset = self._refine(candidate, begin, z)
             better = offset < best
             piece, t = np.where(better, candidate, piece), np.where(better, found, t)
@@ -276,7 +286,7 @@ class Curve:
             goal = self._starts[s_joint]
             off = np.abs(s - goal)
             off = np.minimum(off, self.length - off) if self.closed else off
-            s = np.where(off <= _ROUNDING * self.size, goal, s)
+            s = np.where(off <= _TOLERANCES.rounding * self.size, goal, s)
         return np.where(s < self.length, s, 0.0) if self.closed else s, best
 
     def _measure(self) -> None:
@@ -294,13 +304,13 @@ class Curve:
         self._chord_head = self._point(self._chord_piece, (nth + 1) * self._chord_width)
         every = np.concatenate([self._chord_tail, self._chord_head])
         self.size = float(max(np.ptp(every.real), np.ptp(every.imag)))
-        if not (self.size > _MIN_SIZE and np.abs(every).max() < _MAX_SIZE):
+        if not (self.size > _TOLERANCES.min_size and np.abs(every).max() < _TOLERANCES.max_size):
             raise ValueError(
                 f"a curve of size {self.size:.3g} around {every[0]:.3g} is outside the supported range "
-                f"({_MIN_SIZE:.0e} to {_MAX_SIZE:.0e}): scale the drawing"
+                f"({_TOLERANCES.min_size:.0e} to {_TOLERANCES.max_size:.0e}): scale the drawing"
             )
         lengths = self._length_to(np.arange(count.size), np.ones(count.size))
-        kept = lengths > _ROUNDING * self.size
+        kept = lengths > _TOLERANCES.rounding * self.size
         if not kept.all():
             self._degree, self._control = self._degree[kept], self._control[kept]
             self._angles, self._continues = self._angles[kept], self._continues[kept]
@@ -309,16 +319,19 @@ class Curve:
         self._starts = np.concatenate([[0.0], np.cumsum(lengths)])
         self.length = float(self._starts[-1])
         # Table of lengths with piece and parameter in one number: piece 3, t = 0.25 is 3.25.
-        piece, nth = np.divmod(np.arange(_TABLE_SIZE * lengths.size), _TABLE_SIZE)
-        length = self._starts[piece] + self._length_to(piece, nth / _TABLE_SIZE)
-        self._table = np.append(length, self.length), np.append(piece + nth / _TABLE_SIZE, float(lengths.size))
+        piece, nth = np.divmod(np.arange(_TOLERANCES.table_size * lengths.size), _TOLERANCES.table_size)
+        length = self._starts[piece] + self._length_to(piece, nth / _TOLERANCES.table_size)
+        self._table = (
+            np.append(length, self.length),
+            np.append(piece + nth / _TOLERANCES.table_size, float(lengths.size)),
+        )
 
     def _join(self) -> None:
         """Check that pieces meet; determine whether the curve is closed and its turns at joints."""
         m = self._degree.size
         every = np.arange(m)
         heads, tails = self._point(every, np.ones(m)), self._point(every, np.zeros(m))
-        is_apart = np.abs(heads - np.roll(tails, -1)) > _GAP * self.size
+        is_apart = np.abs(heads - np.roll(tails, -1)) > _TOLERANCES.gap * self.size
         if is_apart[:-1].any():
             k = int(np.argmax(is_apart[:-1]))
             raise ValueError(
@@ -331,7 +344,7 @@ class Curve:
         self._turn = np.angle(ahead / before)
         if not self.closed:
             self._turn[0] = 0.0
-        self.stops = self.corners(np.degrees(_KINK))
+        self.stops = self.corners(np.degrees(_TOLERANCES.kink))
 
     def locate(self, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Piece indices and parameters in [0, 1] at lengths along the curve."""
@@ -344,7 +357,7 @@ class Curve:
         active = np.flatnonzero((self._degree[piece] != 1) & (t > 0) & (t < 1))
         low, high = np.zeros(active.size), np.ones(active.size)
         # Newton's method, with bisection if a step leaves the bracket.
-        for _ in range(_LENGTH_STEPS):
+        for _ in range(_TOLERANCES.length_steps):
             if not active.size:
                 break
             here = t[active]
@@ -405,7 +418,7 @@ class Curve:
         # If control points coincide with an end, the derivative is 0 there, and a short chord gives the direction.
         slow = speed <= ZERO_DERIVATIVE * np.abs(self._control[piece]).max(axis=1).clip(self.size)
         if slow.any():
-            step = np.where(t < 0.5, _CHORD, -_CHORD)
+            step = np.where(t < 0.5, _TOLERANCES.chord, -_TOLERANCES.chord)
             chord = (self._point(piece, t + step) - self._point(piece, t)) / step
             first = np.where(slow, chord, first)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -416,7 +429,7 @@ class Curve:
         """Parameter of the nearest point of a piece to each given point, by Newton's method, and the distance."""
         t, smallest = t.copy(), np.abs(self._point(piece, t) - z)
         best, active = t.copy(), np.arange(z.size)
-        for _ in range(_DISTANCE_STEPS):
+        for _ in range(_TOLERANCES.distance_steps):
             at, here = piece[active], t[active]
             offset = self._point(at, here) - z[active]
             first, second = self._derivatives(at, here)
@@ -431,7 +444,7 @@ class Curve:
             best[active[better]], smallest[active[better]] = there[better], found[better]
             t[active] = there
             # Most points converge in four steps; near a zero of the derivative it takes ten times as many.
-            active = active[np.abs(there - here) > _CONVERGED]
+            active = active[np.abs(there - here) > _TOLERANCES.converged]
             if not active.size:
                 break
         return best, smallest

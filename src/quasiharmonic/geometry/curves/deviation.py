@@ -22,10 +22,6 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Sample points on a section, as fractions of its length.
 _FRACTIONS = np.arange(1, 8) / 8
-# Maximum deviation of an edge relative to the largest initial deviation.
-_MAX_GROWTH = 1.2
-# Squared deviations below this fraction of the squared size of the curve are rounding: the curve is straight.
-_STRAIGHT = 1e-18
 
 
 class DeviationBarrier:
@@ -47,6 +43,10 @@ class DeviationBarrier:
     """
 
     def __init__(self, track: Track, loops: Sequence[IntArray], *, exactly: bool = False) -> None:
+        # Maximum deviation of an edge relative to the largest initial deviation.
+        # Squared deviations below this fraction of the squared size of the curve are rounding: the curve is straight.
+        straight = 1e-18
+        max_growth = 1.2
         following = {int(i): int(j) for loop in loops for i, j in zip(loop, np.roll(loop, -1), strict=True)}
         number = {int(v): k for k, v in enumerate(track.vertices)}
         self._track, self._exactly = track, exactly
@@ -64,9 +64,9 @@ class DeviationBarrier:
             if not chain.curve.closed:
                 tail = tail[tail < chain.s.size - 1]
             head = ahead[tail]
-            bound = _MAX_GROWTH**2 * _max_deviation(chain, tail, head)
+            bound = max_growth**2 * _max_deviation(chain, tail, head)
             kept = chain.sliding[tail] | chain.sliding[head]
-            if bound <= _STRAIGHT * chain.curve.size**2 or not kept.any():
+            if bound <= straight * chain.curve.size**2 or not kept.any():
                 continue
             self._edges.append((k, tail[kept], head[kept]))
             self._bounds.append(bound)
@@ -146,12 +146,12 @@ def _mean_deviation(
     local = (points[:, 1:-1] - points[:, :1]) / side[:, None]
     distance = local.imag * np.abs(side)[:, None]
 
-    def across(vectors: NDArray[np.complex128]) -> FloatArray:
+    def measure_across(vectors: NDArray[np.complex128]) -> FloatArray:
         return np.asarray((vectors * normal.conj()[:, None]).real)
 
-    inner = across(tangents[:, 1:-1])
-    by_begin = (1 - _FRACTIONS) * inner - (1 - local.real) * across(tangents[:, :1])
-    by_end = _FRACTIONS * inner - local.real * across(tangents[:, -1:])
+    inner = measure_across(tangents[:, 1:-1])
+    by_begin = (1 - _FRACTIONS) * inner - (1 - local.real) * measure_across(tangents[:, :1])
+    by_end = _FRACTIONS * inner - local.real * measure_across(tangents[:, -1:])
     by_ends = np.stack([by_begin, by_end], axis=1)
     count = _FRACTIONS.size
     return (

@@ -28,11 +28,6 @@ from quasiharmonic.geometry.mesh.polygons import triangulate
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges, label_components, pair_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, mark, to_integers
 
-# Bound with a margin on the rounding of an orientation, relative to the sum of the magnitudes of its terms.
-_ORIENTATION_BOUND = 4e-16
-# The same for an in-circle determinant.
-_CIRCLE_BOUND = 2e-15
-
 
 class BlockedError(ValueError):
     """A segment passes through the point ``point``, which is not one of its ends."""
@@ -197,7 +192,7 @@ class Triangulation:
         new_edges = []
         while crossing:
             p, q = crossing.popleft()
-            if not self._flippable(p, q):
+            if not self._can_flip(p, q):
                 crossing.append((p, q))
                 continue
             left, right = self._flip(p, q)
@@ -271,11 +266,11 @@ class Triangulation:
             p, q = waiting.pop()
             if (p, q) not in self._apex or (q, p) not in self._apex or (p, q) in self._required:
                 continue
-            if self._in_circle(p, q) and self._flippable(p, q):
+            if self._in_circle(p, q) and self._can_flip(p, q):
                 left, right = self._flip(p, q)
                 waiting += [(p, right), (right, q), (q, left), (left, p)]
 
-    def _flippable(self, p: int, q: int) -> bool:
+    def _can_flip(self, p: int, q: int) -> bool:
         """Whether the two triangles at an edge form a strictly convex quadrilateral."""
         left, right = self._apex[p, q], self._apex[q, p]
         return self._turn(left, right, q) > 0 and self._turn(right, left, p) > 0
@@ -295,15 +290,19 @@ class Triangulation:
 
     def _turn(self, a: int, b: int, c: int) -> float:
         """A number with the exact sign of the orientation of three points."""
+        # Bound with a margin on the rounding of an orientation, relative to the sum of the magnitudes of its terms.
+        bound = 4e-16
         x, y = self._x, self._y
         left = (x[a] - x[c]) * (y[b] - y[c])
         right = (y[a] - y[c]) * (x[b] - x[c])
-        if abs(left - right) > _ORIENTATION_BOUND * (abs(left) + abs(right)) + 1e-300:
+        if abs(left - right) > bound * (abs(left) + abs(right)) + 1e-300:
             return left - right
         return float(orientation(self._array[a], self._array[b], self._array[c]))
 
     def _in_circle(self, p: int, q: int) -> bool:
         """Whether the point across an edge is certainly inside the circumcircle of the triangle to the edge's left."""
+        # Bound with a margin on the rounding of the determinant, relative to the sum of the magnitudes of its terms.
+        bound = 2e-15
         x, y = self._x, self._y
         a, d = self._apex[p, q], self._apex[q, p]
         px, py, qx, qy, ax, ay = x[p] - x[d], y[p] - y[d], x[q] - x[d], y[q] - y[d], x[a] - x[d], y[a] - y[d]
@@ -312,7 +311,7 @@ class Triangulation:
         size = (
             pp * (abs(qx * ay) + abs(qy * ax)) + qq * (abs(ax * py) + abs(ay * px)) + aa * (abs(px * qy) + abs(py * qx))
         )
-        return det > _CIRCLE_BOUND * size
+        return det > bound * size
 
 
 def _snake_order(points: FloatArray) -> IntArray:

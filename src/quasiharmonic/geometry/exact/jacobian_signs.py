@@ -31,8 +31,6 @@ from quasiharmonic.util.arrays import FloatArray, IntArray, map_array, to_intege
 
 # Relative to the product of the extents. Differences, products and at most 36 terms each lose one unit, 2⁻⁵³.
 _RELATIVE_BOUND = 64 * 2.0**-53 * float(np.abs(FORMS).sum(axis=(1, 2)).max())
-# Bound, with a margin, on the loss by underflow in products of numbers of magnitude at most one.
-_UNDERFLOW_BOUND = 2.0**-1000
 
 
 def inverted_elements(F: ArrayLike, points: ArrayLike) -> IntArray:
@@ -77,13 +75,15 @@ def inverted_elements(F: ArrayLike, points: ArrayLike) -> IntArray:
 
 def _find_inverted_curved(nodes: FloatArray) -> IntArray:
     """Inverted elements among second-order triangles (f, 6, 2); (k,) int64."""
+    # Bound, with a margin, on the loss by underflow in products of numbers of magnitude at most one.
+    underflow_bound = 2.0**-1000
     with np.errstate(all="ignore"):
         offsets = nodes - nodes[:, :1]
         exponent = np.frexp(np.abs(offsets).max(axis=(1, 2)))[1]
         offsets = np.ldexp(offsets, -exponent[:, None, None])
         extent = np.abs(offsets).max(axis=1).prod(axis=1)
         values = jacobian_coefficients(offsets[..., 0], offsets[..., 1])
-        bound = (_RELATIVE_BOUND * extent + _UNDERFLOW_BOUND)[:, None]
+        bound = (_RELATIVE_BOUND * extent + underflow_bound)[:, None]
         good, bad = (values > bound).all(axis=1), (values[:, :3] < -bound).any(axis=1)
     # Elements that are not finite are neither good nor bad here.
     for k in np.flatnonzero(~good & ~bad).tolist():

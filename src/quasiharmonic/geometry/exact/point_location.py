@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,30 +28,31 @@ from quasiharmonic.geometry.exact.predicates import orientation, twice_area
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, enumerate_each, invert_indices, mark, repeat_each
 from quasiharmonic.util.kernels import compiled
 
-# Error bound of the determinant l − r of differences of up to 1: (3u + O(u²)) · 2 with u = 2⁻⁵³.
-_UNSURE = 2.0**-50
+
+class LocationTuning(NamedTuple):
+    """Bounds of rounding errors, the nested grid, and blocks. The C kernel has the same values of the grid."""
+
+    # Error bound of the determinant l − r of differences of up to 1: (3u + O(u²)) · 2 with u = 2⁻⁵³.
+    unsure: float = 2.0**-50
+    # The same bound relative to |l| + |r|, and the bound on the loss by underflow.
+    relative: float = 2.0**-51
+    underflow: float = 2.0**-1000
+    # Barycentric coordinates use determinants whose error is at most this fraction of the triangle's determinant.
+    max_error: float = 2.0**-40
+    # Finest cells have coordinates below 2 to this power. Cells ``s`` halvings coarser have them shifted by ``s`` bits.
+    bits: int = 40
+    # A cell beyond an edge's line by more than this, in the unit box, is outside. More if products underflow.
+    margin: float = 2.0**-48
+    underflow_margin: float = 2.0**-1000
+    # Numbers per block, so that the data stay in the cache: points, pairs of a point and a candidate, entries of cells.
+    points: int = 1 << 13
+    pairs: int = 1 << 17
+    entries: int = 1 << 14
+
+
+_TUNING = LocationTuning()
 # Result for a point whose triangle floating point cannot determine.
 _UNDECIDED = -2
-# The same bound relative to |l| + |r|.
-_RELATIVE_BOUND = 2.0**-51
-# Bound on the loss by underflow.
-_UNDERFLOW_BOUND = 2.0**-1000
-# Barycentric coordinates use determinants whose error is at most this fraction of the triangle's determinant.
-_MAX_ERROR = 2.0**-40
-# Points per block, so that the data stay in the cache.
-_POINTS_PER_BLOCK = 1 << 13
-# Pairs of a point and a candidate per block.
-_PAIRS_PER_BLOCK = 1 << 17
-
-# The nested grid. Finest cells have integer coordinates below 2 to this power. A cell ``s`` halvings coarser has these
-# coordinates shifted by ``s`` bits.
-_BITS = 40
-# A cell beyond an edge's line by more than this, in the unit box, is outside in spite of rounding.
-_MARGIN = 2.0**-48
-# Additional margin for products that underflow.
-_UNDERFLOW_MARGIN = 2.0**-1000
-# Entries spread over cells per block, so that the data stay in the cache.
-_ENTRIES_PER_BLOCK = 1 << 14
 
 
 class PointLocator:
@@ -74,8 +76,8 @@ class PointLocator:
         finite.
         """
         found = np.full(len(points), -1, dtype=np.int64)
-        for start in range(0, len(points), _POINTS_PER_BLOCK):
-            here = points[start : start + _POINTS_PER_BLOCK]
+        for start in range(0, len(points), _TUNING.points):
+            here = points[start : start + _TUNING.points]
             boxed = np.flatnonzero(((here >= self._low) & (here <= self._high)).all(axis=1))
             scaled, hits = np.ldexp(here[boxed], self._exponent), np.empty(boxed.size, dtype=np.int64)
             begin, end = self._grid.lists(scaled - self._origin)
@@ -91,8 +93,8 @@ class PointLocator:
         They are never negative, and zero exactly if the point lies on the opposite edge or within 1e-300 of it.
         """
         weights = np.empty((len(points), 3))
-        for start in range(0, len(points), _POINTS_PER_BLOCK):
-            chunk = slice(start, start + _POINTS_PER_BLOCK)
+        for start in range(0, len(points), _TUNING.points):
+            chunk = slice(start, start + _TUNING.points)
             weights[chunk] = self._weights(points[chunk], triangle[chunk])
         return weights
 
@@ -109,8 +111,8 @@ class PointLocator:
     def _contain(self, points: FloatArray, point: IntArray, triangle: IntArray) -> BoolArray:
         """Whether each closed triangle contains the point paired with it."""
         lowest = _lowest_determinants(np.ldexp(points, self._exponent)[point], self._rows.take(triangle, axis=0))
-        contain: BoolArray = lowest > _UNSURE
-        unsure = np.flatnonzero(np.abs(lowest) <= _UNSURE)
+        contain: BoolArray = lowest > _TUNING.unsure
+        unsure = np.flatnonzero(np.abs(lowest) <= _TUNING.unsure)
         if unsure.size:
             p, (a, b, c) = points[point[unsure]], self._corners[triangle[unsure]].swapaxes(0, 1)
             contain[unsure] = (orientation(p, a, b) >= 0) & (orientation(p, b, c) >= 0) & (orientation(p, c, a) >= 0)
@@ -124,8 +126,8 @@ class PointLocator:
         # Row i belongs to corner i: twice the area of the triangle formed by the point and the opposite edge.
         left, right = dx[[1, 2, 0]] * dy[[2, 0, 1]], dy[[1, 2, 0]] * dx[[2, 0, 1]]
         area = left - right
-        error = _RELATIVE_BOUND * (np.abs(left) + np.abs(right)).max(axis=0) + _UNDERFLOW_BOUND
-        inaccurate = np.flatnonzero((error > _MAX_ERROR * area.sum(axis=0)) | (area.min(axis=0) <= error))
+        error = _TUNING.relative * (np.abs(left) + np.abs(right)).max(axis=0) + _TUNING.underflow
+        inaccurate = np.flatnonzero((error > _TUNING.max_error * area.sum(axis=0)) | (area.min(axis=0) <= error))
         if inaccurate.size:
             area[:, inaccurate] = _accurate_areas(points[inaccurate], self._corners[triangle[inaccurate]])
         return (area / area.sum(axis=0)).T
@@ -137,7 +139,7 @@ def _pairs(begin: IntArray, end: IntArray) -> Iterator[tuple[IntArray, IntArray]
     total = np.cumsum(count)
     start = done = 0
     while start < begin.size:
-        stop = max(int(np.searchsorted(total, done + _PAIRS_PER_BLOCK, side="right")), start + 1)
+        stop = max(int(np.searchsorted(total, done + _TUNING.pairs, side="right")), start + 1)
         point = repeat_each(np.arange(start, stop), count[start:stop])
         yield point, np.arange(done, int(total[stop - 1])) + (end - total)[point]
         start, done = stop, int(total[stop - 1])
@@ -155,9 +157,9 @@ def sure_hits(
     for point, entry in _pairs(begin, end):
         triangle = listed[entry]
         lowest = _lowest_determinants(points[point], rows.take(triangle, axis=0))
-        possible = np.flatnonzero(lowest >= -_UNSURE)[::-1]
+        possible = np.flatnonzero(lowest >= -_TUNING.unsure)[::-1]
         # Writing backwards leaves the first candidate.
-        hits[point[possible]] = np.where(lowest > _UNSURE, triangle, _UNDECIDED)[possible]
+        hits[point[possible]] = np.where(lowest > _TUNING.unsure, triangle, _UNDECIDED)[possible]
 
 
 def _lowest_determinants(points: FloatArray, rows: FloatArray) -> FloatArray:
@@ -186,7 +188,7 @@ class _GridLevel:
     triangle: IntArray  # (sum of lengths,): the lists, each ascending
     crowded: BoolArray  # (k,): whether a cell has all of the few triangles that the one had that it is a part of
 
-    def without(self, cells: IntArray) -> _GridLevel:
+    def empty_lists(self, cells: IntArray) -> _GridLevel:
         """Return the level with empty lists for the given cells."""
         kept = ~mark(self.length.size, cells)
         triangle = self.triangle[repeat_each(kept, self.length)]
@@ -233,7 +235,7 @@ class NestedGrid:
             if not split.size:
                 break
             parts[-1][split] = cell_count + 16 * np.arange(split.size)
-            levels[-1] = level.without(split)
+            levels[-1] = level.empty_lists(split)
             levels.append(finer)
             parts.append(np.full(finer.length.size, -1, dtype=np.int64))
             cell_count += finer.length.size
@@ -259,11 +261,11 @@ class NestedGrid:
     def _choose_shift(self) -> int:
         """Number of halvings from the first grid's cells to the finest cells."""
         f = len(self._low)
-        shift = max(_BITS - (f.bit_length() + 1) // 2, 0)
+        shift = max(_TUNING.bits - (f.bit_length() + 1) // 2, 0)
         while True:
             reach = (self._high >> shift) - (self._low >> shift) + 1
             # Long triangles oblique to the grid meet many cells; then use a coarser first grid.
-            if int((reach[:, 0] * reach[:, 1]).sum()) <= self._FIRST_ENTRIES * f or shift >= _BITS:
+            if int((reach[:, 0] * reach[:, 1]).sum()) <= self._FIRST_ENTRIES * f or shift >= _TUNING.bits:
                 return shift
             shift += 1
 
@@ -346,8 +348,8 @@ def divide_cells(
     from scipy.sparse import csr_array
 
     cells, counts = [np.empty(0, dtype=np.int64)], [np.zeros(1, dtype=np.int64)]
-    for start in range(0, triangle.size, _ENTRIES_PER_BLOCK):
-        t, p = triangle[start : start + _ENTRIES_PER_BLOCK], parent[start : start + _ENTRIES_PER_BLOCK]
+    for start in range(0, triangle.size, _TUNING.entries):
+        t, p = triangle[start : start + _TUNING.entries], parent[start : start + _TUNING.entries]
         first = np.maximum(low[t] >> shift, corner[p])
         last = np.minimum(high[t] >> shift, corner[p] + [columns - 1, lines - 1])
         wide, tall = (last - first + 1).T
@@ -384,9 +386,9 @@ def _triangles_meet_cells(
     nx: FloatArray, ny: FloatArray, offset: FloatArray, row: IntArray, x: IntArray, y: IntArray, shift: int
 ) -> BoolArray:
     """Whether triangles, given by row, meet cells that their boxes meet; True if in doubt."""
-    size = 2.0 ** (shift - _BITS)
+    size = 2.0 ** (shift - _TUNING.bits)
     middle_x, middle_y = (x + 0.5) * size, (y + 0.5) * size
-    reach = offset - (0.5 * size + _MARGIN) * (np.abs(nx) + np.abs(ny)) - _UNDERFLOW_MARGIN
+    reach = offset - (0.5 * size + _TUNING.margin) * (np.abs(nx) + np.abs(ny)) - _TUNING.underflow_margin
     meets = np.ones(row.size, dtype=np.bool_)
     for i in range(3):
         meets &= middle_x * nx[row, i] + middle_y * ny[row, i] >= reach[row, i]
@@ -395,4 +397,4 @@ def _triangles_meet_cells(
 
 def _coordinates(points: FloatArray) -> IntArray:
     """Coordinates of the finest cells that contain points of the unit box."""
-    return np.minimum((points * 2.0**_BITS).astype(np.int64), 2**_BITS - 1)
+    return np.minimum((points * 2.0**_TUNING.bits).astype(np.int64), 2**_TUNING.bits - 1)

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,18 +42,26 @@ from quasiharmonic.util.arrays import (
     to_integers,
 )
 
-# |computed − exact| ≤ (3u + O(u²)) (|l| + |r|) for the determinant l − r,
-# u = 2⁻⁵³ [1]_, and 4u covers the second order and the rounding of the bound itself.
-_RELATIVE_BOUND = 2.0**-51
-# Each of the two products, and the bound, may lose up to 2⁻¹⁰⁷⁵ to underflow; sums lose nothing.
-_UNDERFLOW_BOUND = 2.0**-1060
-# After scaling, a coordinate of stage 2 is 0 or at least this; stage 3 takes the other triples. So all
-# intermediate values are multiples of 2⁻⁹⁸⁴, and no product underflows.
-_MIN_SCALED = 2.0**-440
+
+class OrientationBounds(NamedTuple):
+    """Bounds of rounding errors of an orientation. The C kernel has the same values of the first two."""
+
+    # |computed − exact| ≤ (3u + O(u²)) (|l| + |r|) for the determinant l − r, u = 2⁻⁵³ [1]_, and 4u covers the second
+    # order and the rounding of the bound itself.
+    relative_bound: float = 2.0**-51
+    # Each of the two products, and the bound, may lose up to 2⁻¹⁰⁷⁵ to underflow; sums lose nothing.
+    underflow_bound: float = 2.0**-1060
+    # After scaling, a coordinate of stage 2 is 0 or at least this; stage 3 takes the other triples. So all intermediate
+    # values are multiples of 2⁻⁹⁸⁴, and no product underflows.
+    min_scaled: float = 2.0**-440
+    # Triples per block in stage 2, so that the sixteen components stay in the cache.
+    exact_chunk: int = 8192
+
+
+_BOUNDS = OrientationBounds()
+
 # Whether NumPy rounds a sum once. x87 registers round this one to 1 + 2⁻⁵³ first, and then to 1.
 ROUNDS_ONCE = bool(np.add(np.ones(1), 2.0**-53 + 2.0**-78)[0] > 1.0)
-# Triples per block in stage 2, so that the sixteen components stay in the cache.
-_EXACT_CHUNK = 8192
 # Levels of a box tree, from the root, whose pairs are enumerated directly.
 _SKIPPED_LEVELS = 5
 # Pairs of boxes per block in `box_pairs`.
@@ -126,8 +135,8 @@ def _sign_if_certain(
     det = left - right
     bound = np.abs(left)
     bound += np.abs(right)
-    bound *= _RELATIVE_BOUND
-    bound += _UNDERFLOW_BOUND
+    bound *= _BOUNDS.relative_bound
+    bound += _BOUNDS.underflow_bound
     sign = np.asarray(det > bound).view(np.int8)
     sign -= np.asarray(det < -bound).view(np.int8)
     return sign
@@ -141,8 +150,8 @@ def _decide_exactly(x: FloatArray) -> SignArray:
     right = np.sign(x[1] - x[5]) * np.sign(x[2] - x[4])
     sign: SignArray = np.sign(left - right).astype(np.int8)
     undecided = np.flatnonzero((left == right) & (left != 0) & ((x[0] != x[2]) | (x[1] != x[3])))
-    for start in range(0, undecided.size, _EXACT_CHUNK):
-        chunk = undecided[start : start + _EXACT_CHUNK]
+    for start in range(0, undecided.size, _BOUNDS.exact_chunk):
+        chunk = undecided[start : start + _BOUNDS.exact_chunk]
         sign[chunk] = _decide_scaled(x[:, chunk])
     return sign
 
@@ -152,7 +161,7 @@ def _decide_scaled(x: FloatArray) -> SignArray:
     exponent = np.frexp(np.abs(x).max(axis=0))[1]
     scaled = np.ldexp(x, -exponent)
     # Scaling may have rounded the coordinates of these triples; the following code is valid for the others.
-    wide = ((np.abs(scaled) < _MIN_SCALED) & (x != 0)).any(axis=0) | (not ROUNDS_ONCE)
+    wide = ((np.abs(scaled) < _BOUNDS.min_scaled) & (x != 0)).any(axis=0) | (not ROUNDS_ONCE)
     sign = _sign_if_certain(*scaled)
     undecided = (sign == 0) & ~wide
     if np.any(undecided):
@@ -247,8 +256,8 @@ def twice_area(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     """
     x = np.concatenate([a.T, b.T, c.T])
     area = np.empty(x.shape[1])
-    for start in range(0, area.size, _EXACT_CHUNK):
-        chunk = slice(start, start + _EXACT_CHUNK)
+    for start in range(0, area.size, _BOUNDS.exact_chunk):
+        chunk = slice(start, start + _BOUNDS.exact_chunk)
         area[chunk] = exact_sum(_components(x[:, chunk]))
     return area
 

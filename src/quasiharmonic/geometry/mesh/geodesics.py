@@ -33,11 +33,6 @@ from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, as_offsets, invert_indices
 from quasiharmonic.util.progress import heartbeat
 
-# Number of sources in one Dijkstra run, on the subgraph around them.
-_SOURCES_PER_RUN = 64
-# Growth of the search radius for sources that have not reached all of their targets.
-_RADIUS_GROWTH = 1.25
-
 
 def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: float = 0.0) -> csr_array:
     """Lengths of all straight segments between vertices of a surface that cross few of its edges.
@@ -139,6 +134,8 @@ def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target:
     ``target`` (k,) a vertex that is reachable from it. ``reach`` is the initial search radius. The radius grows for
     sources that do not reach all of their targets.
     """
+    # Growth of the search radius for sources that have not reached all of their targets.
+    growth = 1.25
     from scipy.sparse.csgraph import dijkstra
 
     length = np.full(row.shape, np.inf)
@@ -154,15 +151,17 @@ def chain_lengths(segments: csr_array, sources: IntArray, row: IntArray, target:
                 at = index[target[pairs]]
                 length[pairs] = np.where(at < 0, np.inf, distance[k, at])
         left = np.unique(row[np.isinf(length)])
-        limit *= _RADIUS_GROWTH
+        limit *= growth
     return length
 
 
 def _split_sources(sources: IntArray) -> Iterator[tuple[int, IntArray]]:
     """Yield portions of the sources, each with its start."""
-    for start in range(0, sources.size, _SOURCES_PER_RUN):
+    # Number of sources in one Dijkstra run, on the subgraph around them.
+    sources_per_run = 64
+    for start in range(0, sources.size, sources_per_run):
         heartbeat()
-        yield start, sources[start : start + _SOURCES_PER_RUN]
+        yield start, sources[start : start + sources_per_run]
 
 
 def _subgraph_around(graph: csr_array, sources: IntArray, reach: float) -> tuple[IntArray, csr_array, IntArray]:

@@ -12,9 +12,6 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, enumerate
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.threads import count_cores, make_executor
 
-# Texels per block, so that the arrays fit into the cache.
-_BLOCK = 1 << 16
-
 
 class NearestPoint:
     """Finds the nearest points of a surface: exact up to rounding, by samples of the surface in a k-d tree.
@@ -213,12 +210,14 @@ class Raster:
             The triangle with the smallest index that contains the centre, or touches it.
         barycentric : (k, 3) float64
         """
+        # Texels per block, so that the arrays fit into the cache.
+        block = 1 << 16
         size = (end - begin) * self.width
         triangle, weights = np.full(size, -1), np.empty((2, size))
         spans = slice(self._starts[begin], self._starts[end])
         before = np.cumsum(self._count[spans])
         total = int(before[-1]) if before.size else 0
-        cuts = np.searchsorted(before, np.arange(_BLOCK, total, _BLOCK))
+        cuts = np.searchsorted(before, np.arange(block, total, block))
         for part in np.split(np.arange(spans.start, spans.stop), np.unique(cuts)):
             self._draw(part, begin, triangle, weights)
         texel = np.flatnonzero(triangle >= 0)

@@ -26,9 +26,6 @@ from quasiharmonic.util.arrays import (
     scale_to_unit,
 )
 
-# Ears whose scores differ by less count as equal, and the first one is cut, so that rounding does not decide.
-_SCORE_TOLERANCE = 1e-9
-
 Point = tuple[int, int]
 Triangle = tuple[int, int, int]
 
@@ -183,13 +180,15 @@ def _project(points: FloatArray) -> ComplexArray:
 
 def _best_ears(flat: ComplexArray) -> IntArray:
     """Index of the best corner to cut off each polygon (p, k), k > 3; (p,) int64."""
+    # Ears whose scores differ by less count as equal, and the first one is cut, so that rounding does not decide.
+    tolerance = 1e-9
     before, after = np.roll(flat, 1, axis=1), np.roll(flat, -1, axis=1)
     score = _shape(before, flat, after)
     if flat.shape[1] == 4:
         # Score the remaining triangle, too.
         score = np.minimum(score, _shape(after, np.roll(flat, -2, axis=1), before))
     rows = np.arange(len(flat))
-    best = np.argmax(score >= score.max(axis=1, keepdims=True) - _SCORE_TOLERANCE, axis=1)
+    best = np.argmax(score >= score.max(axis=1, keepdims=True) - tolerance, axis=1)
     chosen, is_open, untried = best.copy(), np.ones(len(flat), dtype=np.bool_), score.copy()
     while is_open.any():
         row, ear = rows[is_open], chosen[is_open]
@@ -198,7 +197,7 @@ def _best_ears(flat: ComplexArray) -> IntArray:
         is_open[row[~blocked]] = False
         blocked_rows = row[blocked]
         best_left = untried[blocked_rows].max(axis=1, keepdims=True)
-        chosen[blocked_rows] = np.argmax(untried[blocked_rows] >= best_left - _SCORE_TOLERANCE, axis=1)
+        chosen[blocked_rows] = np.argmax(untried[blocked_rows] >= best_left - tolerance, axis=1)
         # A polygon without any ear crosses itself. Any triangulation is equally bad, so cut the best-scored corner.
         without_ear = blocked_rows[best_left[:, 0] <= 0]
         chosen[without_ear], is_open[without_ear] = best[without_ear], False
@@ -276,7 +275,7 @@ class _Sweep:
         before, after = v - 1, (v + 1) % len(self._corners)
         here = self._corners[v]
         from_left, to_right = self._corners[before] < here, here < self._corners[after]
-        at = self._below(here)
+        at = self._find_below(here)
         interval = self._intervals[at] if at >= 0 else None
         if from_left and to_right:  # on the lower side of an interval
             assert interval is not None
@@ -348,7 +347,7 @@ class _Sweep:
         link.below, next_.above = next_, link
         interval.top = interval.last = link
 
-    def _below(self, point: Point) -> int:
+    def _find_below(self, point: Point) -> int:
         """Index of the highest interval whose lower side is below or at a point; -1 if there is no such interval."""
         low, high = 0, len(self._intervals)
         x, y = point

@@ -42,9 +42,6 @@ from quasiharmonic.util.kernels import compiled
 
 Reference = Literal["equilateral", "rest", "corrected"]
 
-# Triangles in a block: a complex array of one block takes 128 KiB, so about 12 of them fit into a core's cache.
-_BLOCK = 8192
-
 
 def rest_frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray]:
     """Isometrically map every triangle of a mesh to a frame in the plane, with vertex 0 at the origin.
@@ -109,7 +106,9 @@ def blocks(count: int) -> Iterator[slice]:
 
     Formulas with many steps take half the time if all steps are computed for one block before the next.
     """
-    return (slice(start, start + _BLOCK) for start in range(0, count, _BLOCK))
+    # Triangles in a block: a complex array of one block takes 128 KiB, so about 12 of them fit into a core's cache.
+    block = 8192
+    return (slice(start, start + block) for start in range(0, count, block))
 
 
 class ReferenceMesh:

@@ -30,9 +30,6 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.kernels import compiled
 
-# Number of half-edges from which the sparse matrix is faster than a sort.
-_SPARSE_FROM = 10_000
-
 
 @dataclass(frozen=True)
 class Edges:
@@ -72,12 +69,14 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
 @compiled
 def sort_edges(F: IntArray, n: int, pairs: IntArray, sizes: IntArray) -> int:
     """Fill in the edges, kind after kind as in `Edges`, and their numbers; return 0 if F is out of range, else 1."""
+    # Number of half-edges from which the sparse matrix is faster than a sort.
+    sparse_from = 10_000
     if F.size and (F.min() < 0 or F.max() >= n):
         return 0
     T = np.ascontiguousarray(F.T, dtype=np.int32)
     tail, head = T.ravel(), T[(1, 2, 0), :].ravel()
     # SciPy halves the time for large meshes, but importing it for this alone takes longer.
-    sort = _sort_by_rows if tail.size >= _SPARSE_FROM and "scipy.sparse" in sys.modules else _sort_by_keys
+    sort = _sort_by_rows if tail.size >= sparse_from and "scipy.sparse" in sys.modules else _sort_by_keys
     low, high, direction = sort(tail, head, n)
     del T, tail, head
     starts = np.ones(low.size, dtype=bool)

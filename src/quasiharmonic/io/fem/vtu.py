@@ -72,13 +72,15 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
     triangles and quadrilaterals.
     """
     file = _VtuFile(data)
-    points = file.only("Points", None)
+    points = file.find_only("Points", None)
     precision = points.attributes.get("type")
     if precision not in ("Float32", "Float64") or points.attributes.get("NumberOfComponents") != "3":
         raise ValueError(f"its positions must be three Float32 or Float64 each, not {precision}")
     place = file.values(points, 3 * file.points).reshape(-1, 3)
-    ends, kinds = (file.values(file.only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types"))
-    connectivity = file.values(file.only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
+    ends, kinds = (
+        file.values(file.find_only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types")
+    )
+    connectivity = file.values(file.find_only("Cells", "connectivity"), int(ends.max(initial=0))).astype(np.int64)
     starts = np.concatenate([[0], ends])
     F = select_elements(connectivity, starts, kinds, len(place), solid)
     fields, of_cells = (
@@ -143,7 +145,7 @@ class _VtuFile:
         """Return the arrays of an element by name; the last one for several times."""
         return {name: arrays[-1] for (of, name), arrays in self._arrays.items() if of == parent}
 
-    def only(self, parent: str, name: str | None) -> _Array:
+    def find_only(self, parent: str, name: str | None) -> _Array:
         """Return the only array of an element, or the only one with this name."""
         found = [a for (p, n), arrays in self._arrays.items() if p == parent and name in (None, n) for a in arrays]
         if len(found) != 1:

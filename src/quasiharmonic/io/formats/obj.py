@@ -235,7 +235,7 @@ def _pieces(mesh: MeshData) -> Iterator[bytes]:
 
 def _lines(keyword: str, original: OriginalLines | None, rows: NDArray[np.float64]) -> Iterator[bytes]:
     """Yield rows of numbers as text; unchanged rows keep their original lines."""
-    same = np.zeros(len(rows), dtype=np.bool_) if original is None else original.unchanged(rows)
+    same = np.zeros(len(rows), dtype=np.bool_) if original is None else original.find_unchanged(rows)
     if original is None or not same.any():
         yield from _number_lines(keyword, rows)
         return

@@ -58,7 +58,7 @@ class OriginalLines:
     text: bytes
     rows: FloatArray
 
-    def unchanged(self, rows: FloatArray) -> NDArray[np.bool_]:
+    def find_unchanged(self, rows: FloatArray) -> NDArray[np.bool_]:
         """Return which rows equal the numbers of the line with the same index; (m,) bool."""
         same = np.zeros(len(rows), dtype=np.bool_)
         if rows.shape[1:] == self.rows.shape[1:]:

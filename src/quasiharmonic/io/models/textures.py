@@ -9,6 +9,7 @@ import os
 import struct
 import zlib
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,13 +17,21 @@ from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.lowlevel.textual import read_bytes
 
 _IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
-# Colours of the checkerboard, 8 bits per channel.
-_LIGHT = (237, 237, 230)
-_DARK = (41, 97, 191)
-# Squares along a side.
-_SQUARES = 16
-# Pixels along the side of a square.
-_PIXELS = 32
+
+
+class Checkerboard(NamedTuple):
+    """Colours and sizes of the checkerboard."""
+
+    # Colours, 8 bits per channel.
+    light: tuple[int, ...] = (237, 237, 230)
+    dark: tuple[int, ...] = (41, 97, 191)
+    # Squares along a side.
+    squares: int = 16
+    # Pixels along the side of a square.
+    pixels: int = 32
+
+
+_BOARD = Checkerboard()
 
 
 @dataclass(frozen=True)
@@ -97,9 +106,10 @@ def texture_of(data: bytes) -> Texture | None:
 
 def checkerboard() -> Texture:
     """Return a checkerboard texture that repeats without seams."""
-    dark = np.indices((_SQUARES, _SQUARES)).sum(axis=0) % 2 == 1
-    pixels = np.where(dark[..., None], _DARK, _LIGHT).astype(np.uint8).repeat(_PIXELS, axis=0).repeat(_PIXELS, axis=1)
-    side = _SQUARES * _PIXELS
+    dark = np.indices((_BOARD.squares, _BOARD.squares)).sum(axis=0) % 2 == 1
+    squares = np.where(dark[..., None], _BOARD.dark, _BOARD.light).astype(np.uint8)
+    pixels = squares.repeat(_BOARD.pixels, axis=0).repeat(_BOARD.pixels, axis=1)
+    side = _BOARD.squares * _BOARD.pixels
     # Each line starts with a filter byte; 0 means unfiltered.
     lines = np.concatenate([np.zeros((side, 1), dtype=np.uint8), pixels.reshape(side, -1)], axis=1)
     head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)

@@ -139,7 +139,7 @@ class Lattice:
         """Return corners of a polygon in the coordinates of ``approximate``; (r, 2) float64."""
         return self._rounding.round(area.corners)
 
-    def middle(self, area: Convex) -> tuple[float, float]:
+    def find_middle(self, area: Convex) -> tuple[float, float]:
         """Return a position in the middle of a polygon: the mean of three distant corners, rounded once."""
         r, unit = len(area.corners), Fraction(2) ** self._lowest
         three = [area.corners[k] for k in (0, r // 3, 2 * r // 3)]
@@ -155,7 +155,7 @@ class Walls:
         corners = lattice.approximate[ends.T].transpose(2, 0, 1)  # coordinate, end, wall
         self._low, self._high = corners.min(axis=1), corners.max(axis=1)
 
-    def seeing(self, area: Convex, eyes: Sequence[int]) -> Convex | None:
+    def find_seeing(self, area: Convex, eyes: Sequence[int]) -> Convex | None:
         """Return a part of ``area`` of positive area that sees all points ``eyes``, or None if no point does.
 
         A point sees an eye if the open segment between them meets no wall. Walls on the same line, or with an end at

@@ -196,7 +196,7 @@ class Sight:
         self._walls = Walls(ends, fixture.lattice, effort)
         self._views = Views(ends, problem.target, fixture.lattice, beside, effort)
 
-    def hidden(self, star: Star) -> Obstruction | None:
+    def check_view(self, star: Star) -> Obstruction | None:
         """Return an obstruction if no point sees all fixed neighbours to the left of the fixed edges, else None.
 
         Raise `EffortSpentError` if the budget is exhausted before a decision.
@@ -249,7 +249,7 @@ class Sight:
             return False
         area = self._fixture.left_of(self._fixture.extent(), edges)
         return area is not None and any(
-            self._walls.seeing(part, eyes) is not None for part in self._in_view(area, eyes, overlaps)
+            self._walls.find_seeing(part, eyes) is not None for part in self._in_view(area, eyes, overlaps)
         )
 
     def _order_by_overlaps(self, eyes: list[int]) -> tuple[list[int], IntArray | None]:
@@ -258,7 +258,7 @@ class Sight:
         for k in range(1, len(eyes)):
             if least is not None and not len(least):
                 break
-            overlaps = self._views.wedges(eyes[0]).overlapping(self._views.wedges(eyes[k]))
+            overlaps = self._views.wedges(eyes[0]).find_overlapping(self._views.wedges(eyes[k]))
             if overlaps is not None and (least is None or len(overlaps) < len(least)):
                 order, least = [eyes[0], eyes[k], *eyes[1:k], *eyes[k + 1 :]], overlaps
         return order, least

@@ -164,7 +164,7 @@ def _find_unplaced(
         obstruction = half_planes(star, fixture)
         if obstruction is None and sight is not None:
             try:
-                obstruction = sight.hidden(star)
+                obstruction = sight.check_view(star)
             except EffortSpentError:
                 skipped.append(star.vertex)
         if obstruction is not None:

@@ -43,8 +43,6 @@ Point = tuple[int, int, int]
 
 # The degenerate line through a point and itself; every point is on it.
 _NOWHERE: Point = (0, 0, 0)
-# Number of corners whose comparison with a line costs as much as one step through a triangle.
-_CORNERS_PER_STEP = 100
 # Largest number of edges between the vertices of a pair to check.
 LONGEST = 8
 
@@ -158,6 +156,8 @@ class Polygon:
 
     def _extend_ray(self, before: Point, bend: Point) -> tuple[Point, int]:
         """Return where the ray from a point through a corner leaves the polygon, and a triangle there."""
+        # Number of corners whose comparison with a line costs as much as one step through a triangle.
+        corners_per_step = 100
         along = join(before, bend)
         sides = self._sides(along)
         # `distance` is the distance from the bend, up to a positive factor.
@@ -171,7 +171,7 @@ class Polygon:
         exits: list[tuple[Fraction, Point, int]] = []
         beside = np.flatnonzero(sides)
         crossed = np.flatnonzero(sides[beside] != np.roll(sides[beside], -1))
-        self.work += crossed.size + len(sides) // _CORNERS_PER_STEP
+        self.work += crossed.size + len(sides) // corners_per_step
         n = len(sides)
         # The line crosses the boundary between corners on different sides of it: through a side, or through corners on
         # it.

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, cmp_to_key, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,12 +19,19 @@ from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.problem.diagnosis.clipping import MARGIN, Convex, Effort, Lattice, cross, line
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, as_offsets, scale_to_unit
 
-# Number of consecutive wedges that form a row for a first comparison.
-_ROW = 16
-# Limit on the pairs of rows that are compared wedge by wedge.
-_MAX_ROWS = 1024
-# Number of cached views.
-_MAX_CACHED = 200
+
+class ViewTuning(NamedTuple):
+    """Numbers that tune the comparison of views and their cache."""
+
+    # Number of consecutive wedges that form a row for a first comparison.
+    row: int = 16
+    # Limit on the pairs of rows that are compared wedge by wedge.
+    max_rows: int = 1024
+    # Number of cached views.
+    max_cached: int = 200
+
+
+_TUNING = ViewTuning()
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,15 +73,15 @@ class Wedges:
             if part is not None:
                 yield k, part
 
-    def overlapping(self, other: Wedges) -> IntArray | None:
+    def find_overlapping(self, other: Wedges) -> IntArray | None:
         """Return pairs of wedges that may overlap, (m, 2) int64, or None if there are too many candidates."""
         self.effort.spend(300)
         rows = np.argwhere(self._rows_may_reach(other) & other._rows_may_reach(self).T)
-        if len(rows) > _MAX_ROWS:
+        if len(rows) > _TUNING.max_rows:
             return None
-        self.effort.spend(len(rows) * _ROW**2 // 10)
-        in_row = np.stack(np.divmod(np.arange(_ROW**2), _ROW), axis=1)
-        i, j = (_ROW * rows[:, None] + in_row).reshape(-1, 2).T
+        self.effort.spend(len(rows) * _TUNING.row**2 // 10)
+        in_row = np.stack(np.divmod(np.arange(_TUNING.row**2), _TUNING.row), axis=1)
+        i, j = (_TUNING.row * rows[:, None] + in_row).reshape(-1, 2).T
         there = (i < len(self)) & (j < len(other))
         i, j = i[there], j[there]
         for one, two in ((self, other), (other, self)):
@@ -106,7 +113,7 @@ class Wedges:
     @cached_property
     def _boxes(self) -> FloatArray:
         """Corners of bounding boxes of rows of wedges; (rows, 4, 2)."""
-        first = np.arange(0, len(self), _ROW)
+        first = np.arange(0, len(self), _TUNING.row)
         low, high = (extreme.reduceat(self._triangles, as_offsets(first)) for extreme in (np.minimum, np.maximum))
         (x0, y0), (x1, y1) = low.min(axis=1).T, high.max(axis=1).T
         return np.stack([np.stack(corner, axis=1) for corner in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], axis=1)
@@ -114,11 +121,11 @@ class Wedges:
     def _rows_may_reach(self, other: Wedges) -> BoolArray:
         """Return whether rows of these wedges may overlap with rows of others; (rows, rows) bool."""
         if not len(self) or not len(other):
-            return np.zeros((-(-len(self) // _ROW), -(-len(other) // _ROW)), dtype=bool)
+            return np.zeros((-(-len(self) // _TUNING.row), -(-len(other) // _TUNING.row)), dtype=bool)
         mine, boxes = self._boxes[:, None], other._boxes[None]
         reach: BoolArray = np.all(mine[..., 0, :] <= boxes[..., 2, :] + MARGIN, axis=2)
-        first = np.arange(0, len(self), _ROW)
-        last = np.minimum(first + _ROW, len(self)) - 1
+        first = np.arange(0, len(self), _TUNING.row)
+        last = np.minimum(first + _TUNING.row, len(self)) - 1
         right, left = self._rays[0, first, None, None], self._rays[1, last, None, None]
         from_eye = boxes - self.lattice.approximate[self.eye]
         # Rows that span half a circle or more are not bounded by two rays.
@@ -153,7 +160,7 @@ class Views:
         self._scaled = scale_to_unit(positions)
         self._effort = effort
         #: Returns the wedges visible from a point; from a corner, only those inside the target.
-        self.wedges: Callable[[int], Wedges] = lru_cache(_MAX_CACHED)(self._compute_wedges)
+        self.wedges: Callable[[int], Wedges] = lru_cache(_TUNING.max_cached)(self._compute_wedges)
 
     def _compute_wedges(self, eye: int) -> Wedges:
         """Compute the wedges of an eye; walls that end at the eye, or lie on a line with it, hide nothing."""

@@ -7,6 +7,7 @@ cheaper than proving that there is none.
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,16 +16,23 @@ from quasiharmonic.problem.diagnosis.fixture import Corners, Fixture, Stars
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, morton_order
 from quasiharmonic.util.progress import heartbeat
 
-# Number of segments per batch.
-_SEGMENTS = 1 << 14
-# Distances of trial positions from the edges around a vertex, relative to the distance of its neighbours.
-_MARGINS = 0.1, 0.01, 0.001
-# Number of steps to move a trial position.
-_STEPS = 8
-# Limit on the pairs of a segment and a nearby wall to check in each trial: a constant,
-_PAIRS = 1_000_000
-# and a number per star.
-_PAIRS_PER_STAR = 100
+
+class WitnessTuning(NamedTuple):
+    """Numbers that tune the search for witnesses."""
+
+    # Number of segments per batch.
+    segments: int = 1 << 14
+    # Distances of trial positions from the edges around a vertex, relative to the distance of its neighbours.
+    margins: tuple[float, ...] = (0.1, 0.01, 0.001)
+    # Number of steps to move a trial position.
+    steps: int = 8
+    # Limit on the pairs of a segment and a nearby wall to check in each trial: a constant.
+    pairs: int = 1_000_000
+    # The number per star that is added to this limit.
+    pairs_per_star: int = 100
+
+
+_TUNING = WitnessTuning()
 
 
 def clear(
@@ -46,8 +54,8 @@ def clear(
     tail, head = walls.T
     low, high = np.minimum(r, s), np.maximum(r, s)
     spent = 0
-    for start in range(0, len(p), _SEGMENTS):
-        part = order[start : start + _SEGMENTS]
+    for start in range(0, len(p), _TUNING.segments):
+        part = order[start : start + _TUNING.segments]
         a, b, (first, last) = p[part], q[part], ends[part].T
         blocked = np.zeros(len(part), dtype=bool)
         heartbeat()
@@ -72,7 +80,7 @@ def find_unplaced(stars: Stars, fixture: Fixture, corners: Corners | None, walls
     """
     waiting = np.arange(len(stars))
     positions = _neighbour_means(stars, fixture)
-    for margin in (0.0, *_MARGINS, None):
+    for margin in (0.0, *_TUNING.margins, None):
         stars_left = stars.take(waiting)
         if margin is None:
             positions = _area_middles(stars_left, fixture, corners)
@@ -103,7 +111,7 @@ def _move_inward(
         inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
         size = np.zeros(len(stars))
         np.maximum.at(size, stars.of_neighbour, np.hypot(*(where[stars.neighbours] - positions[stars.of_neighbour]).T))
-        for _ in range(_STEPS):
+        for _ in range(_TUNING.steps):
             lacking = margin * size[of] - np.einsum("ij,ij->i", positions[of] - where[edge[:, 0]], inward)
             order = np.lexsort([-lacking, of])
             worst = order[np.append(True, of[order[1:]] != of[order[:-1]])[: len(order)]]
@@ -124,7 +132,7 @@ def _area_middles(stars: Stars, fixture: Fixture, corners: Corners | None) -> Fl
     for k, (begin, end) in enumerate(pairwise([0, *ends.tolist()])):
         area = fixture.left_of(fixture.extent(), edge[begin:end])
         if area is not None:
-            positions[k] = fixture.lattice.middle(area)
+            positions[k] = fixture.lattice.find_middle(area)
     return positions
 
 
@@ -161,7 +169,7 @@ def _are_valid(
     good[of[known][shut]] = False
     candidates = np.flatnonzero(good[of])
     ends = np.stack([eye[candidates], np.full(len(candidates), -1)], axis=1)
-    max_pairs = _PAIRS + _PAIRS_PER_STAR * len(stars)
+    max_pairs = _TUNING.pairs + _TUNING.pairs_per_star * len(stars)
     seen = clear(where[eye[candidates]], positions[of[candidates]], ends, walls, where, max_pairs)
     good[of[candidates[~seen]]] = False
     return good

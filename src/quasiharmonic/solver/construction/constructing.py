@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,19 +24,27 @@ from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import LocalRepair, RandomRestarts, Untangling
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, find_exponent, scale_to_unit, to_complex
 
-# Number of weight updates.
-_WEIGHT_UPDATES = 4
-# Exponent of the areas in the weights.
-_AREA_POWER = 0.5
-# Maximum ratio of weights in one update.
-_MAX_RATIO = 1e6
+
+class ConstructionTuning(NamedTuple):
+    """Numbers that tune the weights and the size of a construction."""
+
+    # Number of weight updates.
+    weight_updates: int = 4
+    # Exponent of the areas in the weights.
+    area_power: float = 0.5
+    # Maximum ratio of weights in one update.
+    max_ratio: float = 1e6
+    # Maximum number of added vertices per mesh vertex before another way to cut is tried.
+    added_per_vertex: int = 50
+    # Final maximum of added vertices: walks around many displaced pins can grow without bound.
+    max_added: int = 60_000
+
+
+_TUNING = ConstructionTuning()
+
 # Methods that untangle the last triangles and may also move vertices on cuts. Each is limited, because double precision
 # may be insufficient.
 _REPAIRS = LocalRepair(tries=30), Untangling(iterations=200), RandomRestarts(max_failures=20, tries=20)
-# Maximum number of added vertices per mesh vertex before another way to cut is tried.
-_ADDED_PER_VERTEX = 50
-# Final maximum of added vertices: walks around many displaced pins can grow without bound.
-_MAX_ADDED = 60_000
 
 
 def embed_pieces(problem: Problem, w: ComplexArray, fixed: IntArray) -> ComplexArray:
@@ -57,7 +66,7 @@ def embed_pieces(problem: Problem, w: ComplexArray, fixed: IntArray) -> ComplexA
 def _candidates(problem: Problem, w: ComplexArray, fixed: IntArray) -> Iterator[ComplexArray]:
     """Yield embeddings with different weights, then maps from untangling the best of them."""
     weights, best, fewest = np.ones(len(problem.F)), w, np.inf
-    for _ in range(1 + _WEIGHT_UPDATES):
+    for _ in range(1 + _TUNING.weight_updates):
         try:
             w = embed_tutte(problem.F, w, fixed, weights)
         except NotPositiveDefinite:
@@ -68,7 +77,7 @@ def _candidates(problem: Problem, w: ComplexArray, fixed: IntArray) -> Iterator[
             best, fewest = w, inverted
         # Small triangles get smaller weights.
         areas = np.abs(signed_areas(problem.F, w))
-        weights = weights * np.clip(areas / areas.max(), 1 / _MAX_RATIO, 1.0) ** _AREA_POWER
+        weights = weights * np.clip(areas / areas.max(), 1 / _TUNING.max_ratio, 1.0) ** _TUNING.area_power
     objective = Objective(problem)
     here = objective.of_map(best)
     for repair in _REPAIRS:
@@ -133,8 +142,8 @@ def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Constructi
     """
     best = None
     # Near a bad map walks may grow without end, because each runs along the previous ones.
-    first = _ADDED_PER_VERTEX * (problem.n + _ADDED_PER_VERTEX)
-    for guide, limit in ((best_map, first), (None, first), (best_map, max(first, _MAX_ADDED))):
+    first = _TUNING.added_per_vertex * (problem.n + _TUNING.added_per_vertex)
+    for guide, limit in ((best_map, first), (None, first), (best_map, max(first, _TUNING.max_added))):
         if best is not None and (limit > first or not best[1]):
             break
         try:

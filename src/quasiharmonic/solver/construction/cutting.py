@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from heapq import heappop, heappush
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,16 +24,23 @@ from quasiharmonic.solver.construction.sheet import Edge, Sheet
 from quasiharmonic.util.arrays import ComplexArray, invert_indices, to_complex
 from quasiharmonic.util.progress import heartbeat
 
-# Factor on length per distance from the segment, relative to its length.
-_DEVIATION_COST = 8.0
-# Costs in lengths of the segment: a step,
-_STEP_COST = 1e-3
-# a split of an edge that must be split at some point,
-_NEEDED_SPLIT_COST = 0.5
-# and another split.
-_OTHER_SPLIT_COST = 1.0
-# Minimum length of a segment in costs, to avoid overflow.
-_SHORTEST = 1e-60
+
+class CuttingCosts(NamedTuple):
+    """Costs of a way along edges, in lengths of the segment that it replaces."""
+
+    # Factor on length per distance from the segment, relative to its length.
+    deviation: float = 8.0
+    # A step along an edge.
+    step: float = 1e-3
+    # A split of an edge that must be split at some point.
+    needed_split: float = 0.5
+    # Another split.
+    other_split: float = 1.0
+    # Minimum length of a segment in costs, to avoid overflow.
+    shortest: float = 1e-60
+
+
+_COSTS = CuttingCosts()
 
 
 def edges_along_sides(sheet: Sheet, regions: Regions, point: Sequence[int]) -> list[Edge]:
@@ -94,7 +102,7 @@ def walk(sheet: Sheet, positions: list[complex], start: int, end: int) -> list[i
     copies: list[int] = []
     # If a walk uses three midpoints in one triangle, two are not joined after splitting, and another walk is needed. If
     # all directions cost the same, the second of the three is a detour.
-    for weight in (_DEVIATION_COST, _DEVIATION_COST, 0.0):
+    for weight in (_COSTS.deviation, _COSTS.deviation, 0.0):
         nodes = _find_path(sheet, positions, start, end, weight)
         copies = [node if isinstance(node, int) else _split(sheet, positions, node) for node in nodes]
         if all(sheet.is_inner(a, b) for a, b in pairwise(copies)):
@@ -111,9 +119,9 @@ def _find_path(sheet: Sheet, positions: list[complex], start: int, end: int, wei
     """Return the path of lowest cost between two copies of vertices (see `Sheet`), found by Dijkstra's algorithm."""
     chord = positions[end] - positions[start]
     axis = chord / (abs(chord) or 1.0)
-    size = max(abs(chord), _SHORTEST)
+    size = max(abs(chord), _COSTS.shortest)
 
-    def where(node: Node) -> complex:
+    def locate(node: Node) -> complex:
         at = positions[node] if isinstance(node, int) else (positions[node[0]] + positions[node[1]]) / 2
         return (at - positions[start]) * axis.conjugate() / size
 
@@ -132,15 +140,15 @@ def _find_path(sheet: Sheet, positions: list[complex], start: int, end: int, wei
         if node == end:
             break
         done.add(node)
-        here = where(node)
+        here = locate(node)
         for other in _neighbours(sheet, node, start, end):
             if other in done:
                 continue
-            there = where(other)
-            further = abs(there - here) * (1 + weight * (deviation(here) + deviation(there))) + _STEP_COST
+            there = locate(other)
+            further = abs(there - here) * (1 + weight * (deviation(here) + deviation(there))) + _COSTS.step
             if not isinstance(other, int):
                 further += (
-                    _NEEDED_SPLIT_COST if sheet.is_fixed(other[0]) and sheet.is_fixed(other[1]) else _OTHER_SPLIT_COST
+                    _COSTS.needed_split if sheet.is_fixed(other[0]) and sheet.is_fixed(other[1]) else _COSTS.other_split
                 )
             if so_far + further < cost.get(other, float("inf")):
                 cost[other], last[other] = so_far + further, node

@@ -21,9 +21,6 @@ from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.solver.construction.sheet import Edge, HalfEdges
 from quasiharmonic.util.arrays import FloatArray, IntArray, cyclic_pairs
 
-# A turn counts as straight if the point is off the line by at most this many roundings of the largest coordinate.
-_ROUNDINGS = 4.0
-
 
 class Regions:
     """A planar region bounded by loops, with interior points, and its partition into convex regions.
@@ -46,9 +43,12 @@ class Regions:
     """
 
     def __init__(self, points: FloatArray, loops: Sequence[IntArray], pins: IntArray) -> None:
+        # A turn counts as straight if the point is off the line by at most this many roundings of the largest
+        # coordinate.
+        roundings = 4.0
         self.points = points
         self._x, self._y = points[:, 0].tolist(), points[:, 1].tolist()
-        self._tolerance = _ROUNDINGS * float(np.spacing(np.abs(points).max()))
+        self._tolerance = roundings * float(np.spacing(np.abs(points).max()))
         rim = np.concatenate([cyclic_pairs(loop) for loop in loops])
         low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
         self.apex = HalfEdges(triangulate_inside(points, rim, low, high)).apex

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import partial
 from itertools import cycle, islice
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,18 +39,25 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.progress import heartbeat
 
-# Rounding of a determinant relative to the sum of its terms' magnitudes, with a margin.
-_FLAT = 1e-15
-# Vertices with more neighbours are not removed.
-_MAX_NEIGHBOURS = 24
-# Maximum number of rounds of evening out and thinning.
-_ROUNDS = 6
-# Maximum number of vertices that are then removed by untangling around them.
-_TRIES = 30
-# Rings around such a vertex that are untangled.
-_RINGS = 2
-# Maximum number of untangling steps.
-_STEPS = 20
+
+class ThinningTuning(NamedTuple):
+    """Numbers that tune the removal of added vertices."""
+
+    # Rounding of a determinant relative to the sum of its terms' magnitudes, with a margin.
+    flat: float = 1e-15
+    # Vertices with more neighbours are not removed.
+    max_neighbours: int = 24
+    # Maximum number of rounds of evening out and thinning.
+    rounds: int = 6
+    # Maximum number of vertices that are then removed by untangling around them.
+    tries: int = 30
+    # Rings around such a vertex that are untangled.
+    rings: int = 2
+    # Maximum number of untangling steps.
+    steps: int = 20
+
+
+_TUNING = ThinningTuning()
 
 
 class Thinning:
@@ -150,7 +158,7 @@ class Thinning:
             polygons = [ring[i : j + 1], ring[j:] + ring[: i + 1]]
         found = []
         for polygon in polygons:
-            cut = triangulate_best(polygon, measure) if len(polygon) <= _MAX_NEIGHBOURS else None
+            cut = triangulate_best(polygon, measure) if len(polygon) <= _TUNING.max_neighbours else None
             if cut is None:
                 return None
             found += cut
@@ -201,7 +209,7 @@ def quality(p: complex, q: complex, r: complex) -> float:
     left = (p.real - r.real) * (q.imag - r.imag)
     right = (p.imag - r.imag) * (q.real - r.real)
     sides = abs(q - p) ** 2 + abs(r - q) ** 2 + abs(p - r) ** 2
-    if abs(left - right) > _FLAT * (abs(left) + abs(right)) + 1e-300:
+    if abs(left - right) > _TUNING.flat * (abs(left) + abs(right)) + 1e-300:
         return (left - right) / sides
     # For a single triangle fractions are much faster than the vectorised predicates.
     (px, py), (qx, qy), (rx, ry) = ((Fraction(z.real), Fraction(z.imag)) for z in (p, q, r))
@@ -281,12 +289,12 @@ def thin_refinement(problem: Problem, refined: Refined, uv: FloatArray) -> tuple
         return refined, given
     unit = Problem.on(problem.domain, np.ldexp(problem.target, -exponent))
     gradings = cycle(GRADINGS)
-    for _ in range(_ROUNDS):
+    for _ in range(_TUNING.rounds):
         refined, uv = _remove_vertices(unit, refined, uv)
         if not len(refined.parents):
             break
         uv = _open_triangles(unit, refined, uv, next(gradings))
-    refined, uv = _remove_vertices(unit, refined, uv, _TRIES)
+    refined, uv = _remove_vertices(unit, refined, uv, _TUNING.tries)
     uv = np.ldexp(uv, exponent)
     uv[problem.fixed] = problem.target
     return refined, uv
@@ -305,7 +313,7 @@ def _remove_vertices(problem: Problem, refined: Refined, uv: FloatArray, tries: 
     thinning = Thinning(problem.F, problem.fixed, refined.F, shares, to_complex(uv))
     thinning.thin()
     for vertex in sorted(thinning.left, reverse=True)[:tries]:
-        thinning.remove_by_untangling(vertex, partial(_untangle_patch, problem.frame), _RINGS)
+        thinning.remove_by_untangling(vertex, partial(_untangle_patch, problem.frame), _TUNING.rings)
     if len(thinning.left) == len(shares):
         return refined, uv
     left = sorted(thinning.left)
@@ -321,5 +329,5 @@ def _untangle_patch(frame: Frame, patch: Patch, w: ComplexArray) -> ComplexArray
     """Untangle a map of a patch, in units of the target; return the last map."""
     inward = frame.inward(to_points(w))
     steps = untangle(patch.F, inward, np.flatnonzero(patch.fixed), grading=GRADINGS[0])
-    *_, last = inward, *islice(steps, _STEPS)
+    *_, last = inward, *islice(steps, _TUNING.steps)
     return np.where(patch.fixed, w, to_complex(frame.outward(last)))

@@ -17,8 +17,16 @@ from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain
-from quasiharmonic.solver.field.objective import Iterate, Objective, Sums, sums_of
-from quasiharmonic.solver.field.passes import clip_moduli, own_sweep, stiffness_of, sweep
+from quasiharmonic.solver.field.objective import (
+    Iterate,
+    Objective,
+    Sums,
+    clip_moduli,
+    own_sweep,
+    stiffness_of,
+    sums_of,
+    sweep,
+)
 from quasiharmonic.solver.field.tensor import TANH, TensorField
 from quasiharmonic.util.arrays import ComplexArray, IntArray
 

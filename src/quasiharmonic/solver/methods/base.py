@@ -241,7 +241,7 @@ class TensorDescent(Descent):
             mu = best.field.mu
         else:
             mu = objective.own_tensor(best.w)
-        return objective.evaluate(objective.bounded(objective.parameterisation.invert(mu)))
+        return objective.evaluate(objective.clip_xi(objective.parameterisation.invert(mu)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,16 +19,23 @@ from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import FunctionalDescent, Iterates
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, work
 
-# Number of pairs of steps and gradient changes in memory.
-_MEMORY = 10
-# Maximum step of a triangle's ξ as a multiple of 1 + |ξ|. With si-log, |μ| = 0.9 is at |ξ| = 8,102.
-_LONGEST = 1.0
-# The same for steps along a gradient alone.
-_FIRST = 0.1
-# Maximum number of trial steps per direction.
-_TRIES = 20
-# Number of steps whose total decrease is compared with the tolerance.
-_WINDOW = 10
+
+class LbfgsTuning(NamedTuple):
+    """Numbers that tune L-BFGS."""
+
+    # Number of pairs of steps and gradient changes in memory.
+    memory: int = 10
+    # Maximum step of a triangle's ξ as a multiple of 1 + |ξ|. With si-log, |μ| = 0.9 is at |ξ| = 8,102.
+    longest: float = 1.0
+    # The same for steps along a gradient alone.
+    first: float = 0.1
+    # Maximum number of trial steps per direction.
+    tries: int = 20
+    # Number of steps whose total decrease is compared with the tolerance.
+    window: int = 10
+
+
+_TUNING = LbfgsTuning()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +61,8 @@ class LBFGS(FunctionalDescent):
         """See `Descent`; values decrease strictly. Converged also if no step lowers the value."""
         stiffness = np.ones(start.xi.size) if self.stiffness is None else self.stiffness
         here, left = start, self.iterations
-        pairs: deque[tuple[ComplexArray, ComplexArray, float]] = deque(maxlen=_MEMORY)
-        values = deque([here.value], maxlen=_WINDOW + 1)
+        pairs: deque[tuple[ComplexArray, ComplexArray, float]] = deque(maxlen=_TUNING.memory)
+        values = deque([here.value], maxlen=_TUNING.window + 1)
         while left > 0:
             before = here.value
             direction = _direction(here.gradient, pairs, stiffness)
@@ -66,26 +73,28 @@ class LBFGS(FunctionalDescent):
                 pairs.clear()
                 continue
 
-            def trial(
+            def evaluate_step(
                 t: float, bound: float, xi: ComplexArray = here.xi, along: ComplexArray = direction
             ) -> tuple[float, Iterate | None]:
                 nonlocal left
                 left -= 1
                 try:
-                    there = objective.evaluate(objective.bounded(xi + t * along))
+                    there = objective.evaluate(objective.clip_xi(xi + t * along))
                 except NotPositiveDefinite:
                     return np.inf, None
                 return there.value, there if there.value < bound else None
 
-            def shorter(t: float, after: float, before: float = before, slope: float = slope) -> float:
+            def choose_factor(t: float, after: float, before: float = before, slope: float = slope) -> float:
                 """Return the factor that leads to the minimum of the interpolating parabola, within 0.1 to 0.5."""
                 if not np.isfinite(after):
                     return 0.25
                 return float(np.clip(-0.5 * slope * t / (after - before - slope * t), 0.1, 0.5))
 
             farthest = float((np.abs(direction) / (1 + np.abs(here.xi))).max())
-            longest = min(1.0, (_LONGEST if pairs else _FIRST) / farthest)
-            taken = backtrack(trial, before, -slope, longest=longest, tries=min(_TRIES, left), factor=shorter)
+            longest = min(1.0, (_TUNING.longest if pairs else _TUNING.first) / farthest)
+            taken = backtrack(
+                evaluate_step, before, -slope, longest=longest, tries=min(_TUNING.tries, left), factor=choose_factor
+            )
             if taken is None:
                 if not pairs or left <= 0:
                     return left > 0
@@ -99,7 +108,7 @@ class LBFGS(FunctionalDescent):
             here = there
             yield here
             values.append(here.value)
-            if len(values) > _WINDOW and values[0] - values[-1] < self.tol * abs(values[-1]):
+            if len(values) > _TUNING.window and values[0] - values[-1] < self.tol * abs(values[-1]):
                 return True
         return False
 

@@ -19,7 +19,7 @@ targets and thin limbs need no special treatment.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -32,25 +32,32 @@ from quasiharmonic.util.progress import heartbeat
 
 Generator = np.random.Generator
 
-# Rings around an inverted triangle, one drawn per patch.
-_RINGS = 3, 8, 24
-# Maximum number of triangles of a patch,
-_MAX_TRIANGLES = 2000
-# and of a patch with the fewest rings, which is large around a vertex with very many neighbours.
-_MAX_NEAR = 20000
-# Least value δ of a positive triangle, as a fraction of its height over its widest side,
-_MIN_SHARE = 0.1
-# and at most this number of widths.
-_MAX_WIDTHS = 1.0
-# Least value δ of an inverted triangle.
-_MIN_UNTANGLED = 1e-3
-# Maximum move of a vertex, in widths of the triangles around it.
-_MAX_MOVE = 20.0
-# Maximum number of simplex steps times triangles: each step takes time proportional to the triangles. The total is
-# about 0.1 to 0.2 CPU seconds.
-_PIVOTS_TIMES_TRIANGLES = 4_000_000
-# Cost of a programme, in steps of untangling the patch.
-_STEPS_PER_PROGRAMME = 100
+
+class LineShiftTuning(NamedTuple):
+    """Numbers that tune the linear programmes of a line shift."""
+
+    # Rings around an inverted triangle, one drawn per patch.
+    rings: tuple[int, ...] = (3, 8, 24)
+    # Maximum number of triangles of a patch.
+    max_triangles: int = 2000
+    # Maximum number for a patch with the fewest rings, which is large around a vertex with very many neighbours.
+    max_triangles_near: int = 20000
+    # Least value δ of a positive triangle, as a fraction of its height over its widest side.
+    min_share: float = 0.1
+    # Maximum of this value δ, in widths.
+    max_widths: float = 1.0
+    # Least value δ of an inverted triangle.
+    min_untangled: float = 1e-3
+    # Maximum move of a vertex, in widths of the triangles around it.
+    max_move: float = 20.0
+    # Maximum number of simplex steps times triangles: each step takes time proportional to the triangles. The total is
+    # about 0.1 to 0.2 CPU seconds.
+    pivots_times_triangles: int = 4_000_000
+    # Cost of a programme, in steps of untangling the patch.
+    steps_per_programme: int = 100
+
+
+_TUNING = LineShiftTuning()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,12 +86,12 @@ class LineShift(VertexDescent):
         rng = np.random.default_rng(0)
 
         def attempt(w: ComplexArray, left: IntArray) -> tuple[Patch, ComplexArray] | None:
-            triangle, rings = int(rng.choice(left)), int(rng.choice(_RINGS))
-            patch = patch_around(problem, triangle, rings, _MAX_TRIANGLES)
-            patch = patch or patch_around(problem, triangle, _RINGS[0], _MAX_NEAR)
+            triangle, rings = int(rng.choice(left)), int(rng.choice(_TUNING.rings))
+            patch = patch_around(problem, triangle, rings, _TUNING.max_triangles)
+            patch = patch or patch_around(problem, triangle, _TUNING.rings[0], _TUNING.max_triangles_near)
             if patch is None:
                 return None
-            effort.count(len(patch.F), _STEPS_PER_PROGRAMME)
+            effort.count(len(patch.F), _TUNING.steps_per_programme)
             return patch, shift_along_lines(rng, patch.F, w[patch.vertices], patch.fixed)
 
         left = inverted_triangles(problem.F, problem.positions(start.w))
@@ -152,15 +159,15 @@ def best_shift(F: IntArray, x: FloatArray, y: FloatArray, fixed: BoolArray) -> F
     where = np.concatenate([row, every]), np.concatenate([column[F[t, corner]], free.size + every])
     A = csr_array((value, where), shape=(count, free.size + count))
     area = (x[F] * dy).sum(axis=1)[concerned] / scale
-    bound = np.where(area > 0, np.minimum(_MIN_SHARE * area, _MAX_WIDTHS), _MIN_UNTANGLED)
+    bound = np.where(area > 0, np.minimum(_TUNING.min_share * area, _TUNING.max_widths), _TUNING.min_untangled)
     heartbeat()
     result = linprog(
         np.repeat([0.0, 1.0], [free.size, count]),
         A_ub=-A,
         b_ub=area - bound,
-        bounds=np.repeat([[-_MAX_MOVE, _MAX_MOVE], [0.0, np.inf]], [free.size, count], axis=0),
+        bounds=np.repeat([[-_TUNING.max_move, _TUNING.max_move], [0.0, np.inf]], [free.size, count], axis=0),
         method="highs-ds",
-        options={"maxiter": max(1, _PIVOTS_TIMES_TRIANGLES // count)},
+        options={"maxiter": max(1, _TUNING.pivots_times_triangles // count)},
     )
     if result.x is None or not np.isfinite(result.x).all():
         return None

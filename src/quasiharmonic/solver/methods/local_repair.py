@@ -25,24 +25,32 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 MAX_INVERTED = 50
 # Maximum number of triangles of a patch,
 MAX_TRIANGLES = 1000
-# and maximum as a fraction of the mesh: above it, untangling the whole mesh is as fast.
-_MAX_SHARE = 0.25
-# Rings of triangles around an inverted one, tried in this order.
-_RINGS = 2, 4, 8, 16
-# Rings around an inverted triangle in a wide patch.
-_WIDE_RINGS = 24
-# Maximum number of triangles of a wide patch,
-_MAX_WIDE = 5000
-# and maximum as a fraction of the mesh.
-_MAX_WIDE_SHARE = 0.5
-# The grading of untangling that solves most wide patches.
-_WIDE_GRADING = 0.5
-# Overhead of a step on a patch, as an equivalent number of triangles.
-_STEP_OVERHEAD = 400
-# The same of an iteration on a mesh.
-_ITERATION_OVERHEAD = 200
-# Maximum mesh size in the cost of an iteration, because patches do not grow with the mesh.
-_LARGE = 4 * MAX_TRIANGLES
+
+
+class RepairTuning(NamedTuple):
+    """Numbers that tune patches and the count of their cost."""
+
+    # Maximum size of a patch as a fraction of the mesh: above it, untangling the whole mesh is as fast.
+    max_share: float = 0.25
+    # Rings of triangles around an inverted one, tried in this order.
+    rings: tuple[int, ...] = (2, 4, 8, 16)
+    # Rings around an inverted triangle in a wide patch.
+    wide_rings: int = 24
+    # Maximum number of triangles of a wide patch.
+    max_wide: int = 5000
+    # Maximum size of a wide patch as a fraction of the mesh.
+    max_wide_share: float = 0.5
+    # The grading of untangling that solves most wide patches.
+    wide_grading: float = 0.5
+    # Overhead of a step on a patch, as an equivalent number of triangles.
+    step_overhead: int = 400
+    # Overhead of an iteration on a mesh, as an equivalent number of triangles.
+    iteration_overhead: int = 200
+    # Maximum mesh size in the cost of an iteration, because patches do not grow with the mesh.
+    large: int = 4 * MAX_TRIANGLES
+
+
+_TUNING = RepairTuning()
 
 
 class Patch(NamedTuple):
@@ -79,12 +87,12 @@ class RepairEffort:
     """
 
     def __init__(self, triangles: int) -> None:
-        self._iteration = min(triangles, _LARGE) + _ITERATION_OVERHEAD
+        self._iteration = min(triangles, _TUNING.large) + _TUNING.iteration_overhead
         self._spent = 0.0
 
     def count(self, triangles: int, steps: int = 1) -> None:
         """Add the cost of steps on a patch with this number of triangles."""
-        self._spent += steps * (triangles + _STEP_OVERHEAD) / self._iteration
+        self._spent += steps * (triangles + _TUNING.step_overhead) / self._iteration
 
     def take_iterations(self) -> int:
         """Return the full iterations spent since the last call."""
@@ -120,8 +128,8 @@ class LocalRepair(VertexDescent):
         problem, solver = objective.problem, objective.laplacian.solver.name
         w, tries = start.w, self.tries
         left = inverted_triangles(problem.F, problem.positions(w))
-        max_triangles = min(MAX_TRIANGLES, int(_MAX_SHARE * len(problem.F)))
-        for rings in _RINGS:
+        max_triangles = min(MAX_TRIANGLES, int(_TUNING.max_share * len(problem.F)))
+        for rings in _TUNING.rings:
             for triangle in left.tolist():
                 if not 0 < left.size <= MAX_INVERTED or tries <= 0:
                     return True
@@ -159,18 +167,18 @@ class WideRepair(VertexDescent):
         """Yield a map after every patch that leaves fewer inverted triangles."""
         problem, solver = objective.problem, objective.laplacian.solver.name
         w, left = start.w, inverted_triangles(problem.F, problem.positions(start.w))
-        max_triangles = min(_MAX_WIDE, int(_MAX_WIDE_SHARE * len(problem.F)))
+        max_triangles = min(_TUNING.max_wide, int(_TUNING.max_wide_share * len(problem.F)))
         tried = np.zeros(len(problem.F), dtype=bool)
         for _ in range(self.tries):
             untried = left[~tried[left]]
             if left.size > MAX_INVERTED or not untried.size:
                 return True
-            patch = patch_around(problem, int(untried[0]), _WIDE_RINGS, max_triangles)
+            patch = patch_around(problem, int(untried[0]), _TUNING.wide_rings, max_triangles)
             tried[untried[0]] = True
             if patch is None:
                 continue
             tried |= np.isin(problem.F, patch.vertices).all(axis=1)
-            moved, remaining = _untangle_patch(problem, w, patch, _WIDE_GRADING, solver)
+            moved, remaining = _untangle_patch(problem, w, patch, _TUNING.wide_grading, solver)
             if remaining.size < left.size:
                 w, left = moved, remaining
                 yield objective.of_map(w)

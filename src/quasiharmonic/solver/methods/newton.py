@@ -19,7 +19,7 @@ direction, and ``H − B K⁻¹ Bᵀ`` tends to the positive definite H.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -30,11 +30,19 @@ from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, TensorDescent
 from quasiharmonic.util.arrays import ComplexArray, sum_at
 
-_FIRST_DAMPING = 1e-2
-_MAX_DAMPING = 1e12
-# Least eigenvalue of a triangle's block K, as a fraction of the largest of all. The block of a triangle that has shrunk
-# to a point is zero and not invertible.
-_MIN_EIGENVALUE = 1e-100
+
+class NewtonTuning(NamedTuple):
+    """Numbers that tune the damping of Newton's method."""
+
+    # First and largest damping.
+    first_damping: float = 1e-2
+    max_damping: float = 1e12
+    # Least eigenvalue of a triangle's block K, as a fraction of the largest of all. The block of a triangle that has
+    # shrunk to a point is zero and not invertible.
+    min_eigenvalue: float = 1e-100
+
+
+_TUNING = NewtonTuning()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,14 +63,14 @@ class Newton(TensorDescent):
         """See `Descent`; converged when no step lowers the energy."""
         mesh, problem = objective.mesh, objective.problem
         system = NewtonSystem(problem.F, 0.5 * mesh.gamma, problem.n, problem.fixed, objective.laplacian.solver.name)
-        here, damping = start, _FIRST_DAMPING
+        here, damping = start, _TUNING.first_damping
         model = SecondOrderModel(here)
         for _ in range(self.iterations):
             try:
                 # If all curvatures underflow, a division by zero gives NaN, and matrices with NaN are rejected.
                 with np.errstate(divide="ignore", invalid="ignore"):
                     step, predicted = model.step(system, damping)
-                there = objective.evaluate(objective.bounded(here.xi + step))
+                there = objective.evaluate(objective.clip_xi(here.xi + step))
             except NotPositiveDefinite:
                 predicted, there = 0.0, None
             gain = (here.dirichlet - there.dirichlet) / predicted if there is not None and predicted > 0 else -np.inf
@@ -74,7 +82,7 @@ class Newton(TensorDescent):
                 here = there
                 yield here
                 model = SecondOrderModel(here)
-            elif damping > _MAX_DAMPING:
+            elif damping > _TUNING.max_damping:
                 return True
         return False
 
@@ -135,7 +143,7 @@ class SecondOrderModel:
         # An inverted triangle may have a concave block: take absolute eigenvalues and bound them away from zero.
         mean, half = 0.5 * (k11 + k22), np.hypot(0.5 * (k11 - k22), k12)
         high, low = np.abs(mean + half), np.abs(mean - half)
-        floor = 1e-10 * np.maximum(high, low) + _MIN_EIGENVALUE * high.max()
+        floor = 1e-10 * np.maximum(high, low) + _TUNING.min_eigenvalue * high.max()
         high, low = np.maximum(high, floor), np.maximum(low, floor)
         # Keep the eigenvectors: scale the deviator to the new half difference, which may have either sign.
         swapped = np.abs(mean - half) > np.abs(mean + half)

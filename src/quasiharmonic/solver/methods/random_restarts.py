@@ -7,15 +7,14 @@ fold.
 
 A patch around an inverted triangle is therefore restarted many times. One kind of start is a quasi-harmonic map of
 random tensors. Another moves a vertex of that triangle into its intersection and fixes it while the other vertices
-make space. If a chain of vertices must go around the fold, the inverted triangles get more weight
-(`quasiharmonic.solver.methods.reweighting`). A patch is accepted if it does not increase the number of inverted
-triangles, so the map may drift until all triangles fit.
+make space. If a chain of vertices must go around the fold, the inverted triangles get more weight (`reweight`). A patch
+is accepted if it does not increase the number of inverted triangles, so the map may drift until all triangles fit.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -38,25 +37,31 @@ from quasiharmonic.solver.methods.local_repair import (
     remap_patches,
     untangle_fully,
 )
-from quasiharmonic.solver.methods.reweighting import reweight
 from quasiharmonic.solver.methods.untangling import GRADINGS, untangle
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, check_integer, mark, to_points
 
 Generator: TypeAlias = np.random.Generator
 
-# Rings around an inverted triangle, and sizes of the random ξ; one of each is drawn.
-_RINGS = 2, 3, 4, 6, 8, 12
-_SPREADS = 0.0, 0.5, 1.5
-# V₃ over the target's area below which a problem gets more tries. Of ten thousand generated problems, those without a
-# solution end above 1e-4. Those with a solution that needs many tries end below 1e-6.
-_PROMISING_ENERGY = 1e-5
-# Factor by which such a problem gets more tries.
-_MORE_TRIES = 10
-# Fraction of tries that use weights; these take several times as long as the others.
-_REWEIGHTED = 0.5
-# A moved vertex lies at a fraction of the way from a corner of the intersection to its centre; range of its decimal
-# logarithm.
-_DEPTHS = -3.5, 0.0
+
+class RestartTuning(NamedTuple):
+    """Numbers that tune the random starts of patches."""
+
+    # Rings around an inverted triangle, and sizes of the random ξ; one of each is drawn.
+    rings: tuple[int, ...] = (2, 3, 4, 6, 8, 12)
+    spreads: tuple[float, ...] = (0.0, 0.5, 1.5)
+    # V₃ over the target's area below which a problem gets more tries. Of ten thousand generated problems, those without
+    # a solution end above 1e-4. Those with a solution that needs many tries end below 1e-6.
+    promising_energy: float = 1e-5
+    # Factor by which such a problem gets more tries.
+    more_tries: int = 10
+    # Fraction of tries that use weights; these take several times as long as the others.
+    reweighted: float = 0.5
+    # A moved vertex lies at a fraction of the way from a corner of the intersection to its centre; range of its decimal
+    # logarithm.
+    depths: tuple[float, float] = (-3.5, 0.0)
+
+
+_TUNING = RestartTuning()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,12 +106,12 @@ class RandomRestarts(VertexDescent):
                     return True
             left = inverted_triangles(problem.F, problem.positions(w))
         patience, effort = self.max_failures, RepairEffort(len(problem.F))
-        if 0 < left.size <= MAX_INVERTED and objective.of_map(w).energy < _PROMISING_ENERGY:
-            patience *= _MORE_TRIES
+        if 0 < left.size <= MAX_INVERTED and objective.of_map(w).energy < _TUNING.promising_energy:
+            patience *= _TUNING.more_tries
 
         def attempt(w: ComplexArray, left: IntArray) -> tuple[Patch, ComplexArray] | None:
             effort.count(0)
-            patch = patch_around(problem, int(rng.choice(left)), int(rng.choice(_RINGS)), MAX_TRIANGLES)
+            patch = patch_around(problem, int(rng.choice(left)), int(rng.choice(_TUNING.rings)), MAX_TRIANGLES)
             if patch is None:
                 return None
             try:
@@ -124,7 +129,7 @@ def _restart(
     rng: Generator, problem: Problem, patch: Patch, w: ComplexArray, solver: str, effort: RepairEffort
 ) -> ComplexArray:
     """Return another map of a patch, found from a random start."""
-    if rng.random() < _REWEIGHTED:
+    if rng.random() < _TUNING.reweighted:
         return reweight(rng, patch, w, solver, effort)
     grading = float(rng.choice(GRADINGS))
     choice = _choose_position(rng, problem, patch, w) if rng.random() < 0.5 else None
@@ -141,7 +146,7 @@ def _restart(
 
 def _random_map(rng: Generator, patch: Patch, w: ComplexArray, fixed: BoolArray, linear_solver: str) -> ComplexArray:
     """Return a quasi-harmonic map of random tensors with the ``fixed`` vertices at their positions in ``w``."""
-    xi = rng.choice(_SPREADS) * (rng.standard_normal(len(patch.F)) + 1j * rng.standard_normal(len(patch.F)))
+    xi = rng.choice(_TUNING.spreads) * (rng.standard_normal(len(patch.F)) + 1j * rng.standard_normal(len(patch.F)))
     mesh = ReferenceMesh(np.zeros((len(w), 2)), patch.F, "equilateral")
     laplacian = Laplacian(patch.F, len(w), np.flatnonzero(fixed), linear_solver)
     return laplacian.factor(mesh.edge_stiffness(TANH.field(xi).entries())).extend(w)
@@ -170,7 +175,7 @@ def _choose_position(rng: Generator, problem: Problem, patch: Patch, w: ComplexA
         region = left_of(region, tail, head)
         if len(region) < 3:
             return None
-    depth = 10 ** rng.uniform(*_DEPTHS)
+    depth = 10 ** rng.uniform(*_TUNING.depths)
     corner = rng.choice(np.append(region, find_nearest(region, w[vertex])))
     return vertex, complex((1 - depth) * corner + depth * region.mean())
 
@@ -193,3 +198,45 @@ def find_nearest(region: ComplexArray, point: complex) -> complex:
     share, distance = nearest_on_segments(to_points(np.array([point])), to_points(region), to_points(ahead))
     k = int(np.argmin(distance))
     return complex(region[k] + share[k] * (ahead[k] - region[k]))
+
+
+class ReweightingTuning(NamedTuple):
+    """Numbers that tune the rounds of reweighting."""
+
+    # Possible factors of an inverted triangle's weight per round; one is drawn for all rounds.
+    factors: tuple[float, ...] = (3.0, 10.0)
+    # Maximum number of rounds.
+    rounds: int = 15
+    # If a map has this many more inverted triangles than the first, it does not recover, and the rounds end.
+    max_extra: int = 15
+
+
+_REWEIGHTING = ReweightingTuning()
+
+
+def reweight(
+    rng: Generator, patch: Patch, w: ComplexArray, linear_solver: str, effort: RepairEffort | None = None
+) -> ComplexArray:
+    """Return another map of a patch, found by weighting its inverted triangles.
+
+    Untangling starts with a large ε, for which its energy has hardly more than one minimum. From any start a patch
+    therefore ends in one of the same few maps, and another result needs another energy. Triangles that stay inverted
+    get more weight in every round, as constraints do in searches for satisfying assignments. They are untangled at the
+    expense of others, which gain weight in turn, until all triangles fit.
+
+    It is the first map without inverted triangles, or else the last one with no more of them than ``w`` (v,). ``rng``
+    draws the factor and the grading of every round.
+    """
+    factor = float(rng.choice(_REWEIGHTING.factors))
+    weights = np.ones(len(patch.F))
+    inverted = signed_areas(patch.F, w) <= 0
+    first, last = inverted.sum(), w
+    for _ in range(_REWEIGHTING.rounds):
+        weights[inverted] *= factor
+        w = untangle_fully(patch, w, patch.fixed, float(rng.choice(GRADINGS)), linear_solver, weights, effort)
+        inverted = signed_areas(patch.F, w) <= 0
+        if inverted.sum() <= first:
+            last = w
+        if not inverted.any() or inverted.sum() > first + _REWEIGHTING.max_extra:
+            break
+    return last

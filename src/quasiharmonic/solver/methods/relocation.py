@@ -24,28 +24,35 @@ from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, any_corner, invert_indices, mark
 from quasiharmonic.util.kernels import compiled
 
-# Maximum number of inverted triangles for a try: with more it usually fails, and without compiled kernels it is slower
-# than a step.
-_MAX_INVERTED = 12
-# The same for the first map, from which the descent may be long.
-_MAX_AT_FIRST = 100
-# After a failed try, the next is made when the number of inverted triangles has fallen to this fraction, or when the
-# number of steps has doubled plus two.
-_FEWER = 0.75
-# Maximum number of sweeps over the vertices of inverted triangles.
-_SWEEPS = 8
-# Maximum number of consecutive sweeps without progress.
-_IN_VAIN = 3
-# Number of sweeps over moved vertices and their neighbours after success, to even out the heights.
-_SHARING = 2
-# Maximum number of triangles around a vertex: 16 have 560 triples.
-_MOST_AROUND = 16
-# A group with at least this many vertices is divided by the number of triangles around them,
-_LARGE_GROUP = 16
-# at these numbers: 6 triangles have 20 triples, 12 have 220.
-_SIZES = 6, 8
-# Maximum number of heights computed at once, so that arrays stay in the cache.
-_HEIGHTS = 30_000
+
+class RelocationTuning(NamedTuple):
+    """Numbers that tune relocation. The C kernel has the same values of the four from `sweeps` to `most_around`."""
+
+    # Maximum number of inverted triangles for a try: with more it usually fails, and without compiled kernels it is
+    # slower than a step.
+    max_inverted: int = 12
+    # The same for the first map, from which the descent may be long.
+    max_inverted_at_first: int = 100
+    # After a failed try, the next is made when the number of inverted triangles has fallen to this fraction, or when
+    # the number of steps has doubled plus two.
+    fewer: float = 0.75
+    # Maximum number of sweeps over the vertices of inverted triangles.
+    sweeps: int = 8
+    # Maximum number of consecutive sweeps without progress.
+    in_vain: int = 3
+    # Number of sweeps over moved vertices and their neighbours after success, to even out the heights.
+    sharing: int = 2
+    # Maximum number of triangles around a vertex: 16 have 560 triples.
+    most_around: int = 16
+    # A group with at least this many vertices is divided by the number of triangles around them.
+    large_group: int = 16
+    # Numbers of triangles at which such a group is divided: 6 triangles have 20 triples, 12 have 220.
+    sizes: tuple[int, ...] = (6, 8)
+    # Maximum number of heights computed at once, so that arrays stay in the cache.
+    heights: int = 30_000
+
+
+_TUNING = RelocationTuning()
 
 
 class RetrySchedule:
@@ -58,11 +65,11 @@ class RetrySchedule:
     def is_due(self, inverted: int) -> bool:
         """Whether to try the next map of the descent, given its number of inverted triangles."""
         step, self._steps = self._steps, self._steps + 1
-        if not 0 < inverted <= (_MAX_INVERTED if step else _MAX_AT_FIRST):
+        if not 0 < inverted <= (_TUNING.max_inverted if step else _TUNING.max_inverted_at_first):
             return False
         if inverted > self._retry_below and step < self._retry_step:
             return False
-        self._retry_below, self._retry_step = _FEWER * inverted, 2 * step + 2
+        self._retry_below, self._retry_step = _TUNING.fewer * inverted, 2 * step + 2
         return True
 
 
@@ -95,15 +102,15 @@ def place_inverted(
     fewest, failures = np.full(untangled.size, len(F) + 1), np.zeros(untangled.size, dtype=np.int64)
     vertices, groups = np.empty(0, dtype=np.int64), list[_VertexStars]()
     T, of, active = F, mesh, np.ones(fewest.size, dtype=bool)
-    for sweep in range(_SWEEPS + 1):
+    for sweep in range(_TUNING.sweeps + 1):
         left = np.flatnonzero(~(signed_areas(T, w) > 0))
         count = np.bincount(of[left], minlength=fewest.size)
         failures = np.where(count < fewest, 0, failures + 1)
         fewest = np.where(active, np.minimum(count, fewest), fewest)
-        active = (count > 0) & (failures < _IN_VAIN)
+        active = (count > 0) & (failures < _TUNING.in_vain)
         before, vertices = vertices, np.unique(T[left[active[of[left]]]])
         vertices = vertices[free[vertices]]
-        if not vertices.size or sweep == _SWEEPS:
+        if not vertices.size or sweep == _TUNING.sweeps:
             break
         T, of = T[active[of]], of[active[of]]
         if not np.array_equal(vertices, before):
@@ -116,7 +123,7 @@ def place_inverted(
         T, of = F[untangled[mesh]], mesh[untangled[mesh]]
         near[T[any_corner((w != given)[T])]] = True
         groups, there = _divide(T, np.flatnonzero(near & free), len(w)), w.copy()
-        for _ in range(_SHARING):
+        for _ in range(_TUNING.sharing):
             _relocate_groups(there, groups)
         # Except for rounding, no height falls below the least of those around it.
         spoilt = np.bincount(of[~(signed_areas(T, there) > 0)], minlength=untangled.size) > 0
@@ -154,7 +161,7 @@ def _divide(F: IntArray, vertices: IntArray, n: int) -> list[_VertexStars]:
     neighbours, start = number[tails].tolist(), [*first.tolist(), own.size]
     # Each group is a bit. Vertices without a group have no bit; index -1 stands for vertices outside the list.
     group = [0] * (vertices.size + 1)
-    for vertex in np.flatnonzero(count <= _MOST_AROUND).tolist():
+    for vertex in np.flatnonzero(count <= _TUNING.most_around).tolist():
         taken = 0
         for other in neighbours[start[vertex] : start[vertex + 1]]:
             taken |= group[other]
@@ -170,14 +177,14 @@ def _divide(F: IntArray, vertices: IntArray, n: int) -> list[_VertexStars]:
 
 def _divide_by_size(members: IntArray, count: IntArray) -> list[IntArray]:
     """Divide a large group by the number of triangles around its vertices, and into parts of limited size."""
-    if members.size < _LARGE_GROUP:
+    if members.size < _TUNING.large_group:
         return [members]
-    size, some = np.searchsorted(_SIZES, count[members]), list[IntArray]()
-    for k in range(len(_SIZES) + 1):
+    size, some = np.searchsorted(_TUNING.sizes, count[members]), list[IntArray]()
+    for k in range(len(_TUNING.sizes) + 1):
         alike = members[size == k]
         if alike.size:
             around = int(count[alike].max())
-            some += np.array_split(alike, -(-alike.size * around * comb(around, 3) // _HEIGHTS))
+            some += np.array_split(alike, -(-alike.size * around * comb(around, 3) // _TUNING.heights))
     return some
 
 

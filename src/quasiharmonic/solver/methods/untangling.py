@@ -32,33 +32,41 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_
 
 # Powers of the boundary edges' lengths, tried in this order.
 GRADINGS = 0.5, 0.0, 1.0
-# Weight of areas relative to angles.
-_LAMBDA = 1e-4
-# First ε, as a fraction of the absolute least determinant.
-_FIRST_EPSILON = 0.2
-# Maximum number of steps at each ε.
-_STEPS = 20
-# Relative decrease of the energy below which ε is reduced.
-_MIN_DECREASE = 1e-3
-# If ε falls below this fraction of the least determinant, hardly any triangle is untangled any more.
-_MIN_EPSILON = 5e-3
-# Smaller determinants belong to triangles as small as the rounding of positions. A determinant of zero would never end
-# the loop over ε.
-_MIN_DETERMINANT = 1e-30
-# For `open_triangles`: an ε so small that the energy is a barrier,
-_BARRIER_EPSILON = 1e-9
-# the maximum number of steps,
-_OPENING_STEPS = 10
-# and the least relative decrease per step.
-_MIN_OPENING_DECREASE = 1e-2
-# Smallest reference triangle relative to the largest,
-_MIN_RELATIVE_SIZE = 1e-70
-# and absolute: squared areas must not underflow.
-_MIN_SIZE = 1e-140
-# Shifts of the diagonal, tried in this order until a factorisation exists.
-_SHIFTS = 0.0, 1e-10, 1e-6, 1e-3
-# Maximum number of halvings of a step.
-_HALVINGS = 24
+
+
+class UntanglingTuning(NamedTuple):
+    """Numbers that tune untangling."""
+
+    # Weight λ of areas relative to angles.
+    area_weight: float = 1e-4
+    # First ε, as a fraction of the absolute least determinant.
+    first_epsilon: float = 0.2
+    # Maximum number of steps at each ε.
+    steps: int = 20
+    # Relative decrease of the energy below which ε is reduced.
+    min_decrease: float = 1e-3
+    # If ε falls below this fraction of the least determinant, hardly any triangle is untangled any more.
+    min_epsilon: float = 5e-3
+    # Smaller determinants belong to triangles as small as the rounding of positions. A determinant of zero would never
+    # end the loop over ε.
+    min_determinant: float = 1e-30
+    # For `open_triangles`: an ε so small that the energy is a barrier.
+    barrier_epsilon: float = 1e-9
+    # For `open_triangles`: the maximum number of steps.
+    opening_steps: int = 10
+    # For `open_triangles`: the least relative decrease per step.
+    min_opening_decrease: float = 1e-2
+    # Smallest reference triangle relative to the largest.
+    min_relative_size: float = 1e-70
+    # Smallest reference triangle: squared areas must not underflow.
+    min_size: float = 1e-140
+    # Shifts of the diagonal, tried in this order until a factorisation exists.
+    shifts: tuple[float, ...] = (0.0, 1e-10, 1e-6, 1e-3)
+    # Maximum number of halvings of a step.
+    halvings: int = 24
+
+
+_TUNING = UntanglingTuning()
 
 
 class Regularised(Isotropic):
@@ -78,21 +86,21 @@ class Regularised(Isotropic):
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """Return ``(1 ± G)/χ`` with ``G = 2λD − N/ρ``, since ``χ' = χ/ρ`` with ``ρ = √(ε² + D²)``."""
         root, chi, numerator = self._parts(d)
-        by_det = 2 * _LAMBDA * d.det - numerator / root
+        by_det = 2 * _TUNING.area_weight * d.det - numerator / root
         return (1 + by_det) / chi, (1 - by_det) / chi
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the Hessian: ``φ_SD = −1/(χρ)``, ``φ_DD = 2λ (1 − 2D/ρ)/χ + 2N/ρ³``, φ_SS = 0 with ``S = a + b``."""
         root, chi, numerator = self._parts(d)
         mixed = -1 / (chi * root)
-        pure = 2 * _LAMBDA * (1 - 2 * d.det / root) / chi + 2 * numerator / root**3
+        pure = 2 * _TUNING.area_weight * (1 - 2 * d.det / root) / chi + 2 * numerator / root**3
         return pure + 2 * mixed, -pure, pure - 2 * mixed
 
     def _parts(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         root = np.hypot(self.epsilon, d.det)
         # D + ρ without cancellation.
         chi = np.where(d.det > 0, 0.5 * (d.det + root), 0.5 * self.epsilon**2 / (root + np.abs(d.det)))
-        return root, chi, d.a + d.b + _LAMBDA * (d.det**2 + 1)
+        return root, chi, d.a + d.b + _TUNING.area_weight * (d.det**2 + 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,10 +179,10 @@ def untangle(
     with np.errstate(all="ignore"):
         descent = RegularisedDescent(F, w, fixed, references, linear_solver, 1.0 if weights is None else weights)
     min_det = descent.min_det
-    descent.energy.epsilon = np.hypot(1e-9, _FIRST_EPSILON * min_det)
-    while not min_det > 0 and descent.energy.epsilon > _MIN_EPSILON * max(abs(min_det), _MIN_DETERMINANT):
+    descent.energy.epsilon = np.hypot(1e-9, _TUNING.first_epsilon * min_det)
+    while not min_det > 0 and descent.energy.epsilon > _TUNING.min_epsilon * max(abs(min_det), _TUNING.min_determinant):
         before = descent.value()
-        for _ in range(_STEPS):
+        for _ in range(_TUNING.steps):
             with np.errstate(all="ignore"):
                 after = descent.step(before)
             if after is None:
@@ -182,7 +190,7 @@ def untangle(
             yield descent.w
             if descent.min_det > 0:
                 return
-            if after > (1 - _MIN_DECREASE) * before:
+            if after > (1 - _TUNING.min_decrease) * before:
                 break
             before = after
         min_det = descent.min_det
@@ -203,14 +211,14 @@ def open_triangles(F: IntArray, w: ComplexArray, fixed: IntArray, *, grading: fl
         return w
     with np.errstate(all="ignore"):
         descent = RegularisedDescent(F, w, fixed, references, "auto", 1.0)
-        descent.energy.epsilon = _BARRIER_EPSILON
+        descent.energy.epsilon = _TUNING.barrier_epsilon
         before = descent.value()
-        for _ in range(_OPENING_STEPS):
+        for _ in range(_TUNING.opening_steps):
             after = descent.step(before)
             if after is None or not descent.min_det > 0:
                 break
             w = descent.w
-            if after > (1 - _MIN_OPENING_DECREASE) * before:
+            if after > (1 - _TUNING.min_opening_decrease) * before:
                 break
             before = after
     return w
@@ -248,9 +256,9 @@ def _equilateral_references(F: IntArray, w: ComplexArray, grading: float, linear
         log = embed_tutte(F, log, np.flatnonzero(ends), linear_solver=linear_solver)
     sizes: FloatArray = np.exp(log.real[F].mean(axis=1))
     sizes = scale_to_unit(sizes)
-    sizes = np.maximum(sizes, _MIN_RELATIVE_SIZE * sizes.max())
+    sizes = np.maximum(sizes, _TUNING.min_relative_size * sizes.max())
     sizes = sizes * np.sqrt(area / (np.sqrt(3) / 4 * (sizes**2).sum()))
-    if not sizes.min() > _MIN_SIZE:
+    if not sizes.min() > _TUNING.min_size:
         return None
     corners = np.array([[0, 0], [1, 0], [0.5, np.sqrt(0.75)]])
     return _References(sizes[:, None, None] * corners, sizes**2)
@@ -294,7 +302,7 @@ class RegularisedDescent:
         system = self._system
         gradient = self._deformation_energy.gradient_of(self._deformation, self.w.size)[system.free]
         system.assemble(self._deformation_energy.curvature_of(self._deformation))
-        found = system.descent(gradient, _SHIFTS)
+        found = system.descent(gradient, _TUNING.shifts)
         if found is None or not found[1] > 0:
             return None
         direction, expected_decrease, _ = found
@@ -302,14 +310,14 @@ class RegularisedDescent:
         full[system.free] = direction
         start = self.w
 
-        def trial(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
+        def evaluate_step(t: float, bound: float) -> tuple[float, tuple[ComplexArray, Deformation] | None]:
             w = start + t * full
             at = self._deformation_energy.deform(w)
             value = self._deformation_energy.value_of(at)
             return value, (w, at) if value < bound else None
 
-        taken = backtrack(trial, before, expected_decrease, tries=_HALVINGS)
+        taken = backtrack(evaluate_step, before, expected_decrease, tries=_TUNING.halvings)
         if taken is None:
             return None
-        _, after, (self.w, self._deformation) = extend(trial, taken)
+        _, after, (self.w, self._deformation) = extend(evaluate_step, taken)
         return after

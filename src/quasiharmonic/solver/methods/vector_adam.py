@@ -108,18 +108,18 @@ class AdamState:
         self._square = np.zeros(triangles)
         self._steps = 0
 
-    def part(self, triangles: IntArray | slice) -> AdamState:
+    def take_part(self, triangles: IntArray | slice) -> AdamState:
         """Return the state of some of the triangles, to continue separately."""
-        return self._with(self._mean[triangles], self._square[triangles])
+        return self._copy_with(self._mean[triangles], self._square[triangles])
 
     @staticmethod
     def join(paces: Sequence[AdamState]) -> AdamState:
         """Concatenate states that have made equally many steps."""
-        return paces[0]._with(
+        return paces[0]._copy_with(
             np.concatenate([state._mean for state in paces]), np.concatenate([state._square for state in paces])
         )
 
-    def _with(self, mean: ComplexArray, square: FloatArray) -> AdamState:
+    def _copy_with(self, mean: ComplexArray, square: FloatArray) -> AdamState:
         """Return a state with the same settings and step count."""
         other = AdamState(0, self._momenta, self._times, self._lengths)
         # Copy the arrays, because every step changes them.

@@ -17,6 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,16 +44,25 @@ AROUND = "edges split around inverted triangles"
 CONSTRUCTED = "constructed"
 _Selection = Callable[[Stages], Stages]
 _Search = Callable[[Problem, FloatArray | None, int, _Selection], MapResult]
-# Limits of a search if a construction exists: iterations, and triangles times iterations for large meshes.
-_REDUCED_ITERATIONS = 600
-_REDUCED_WORK = 1_500_000
-# Rounds of splitting around inverted triangles, with and without a construction.
-_REDUCED_ROUNDS = 1
-_ROUNDS = 3
-# Of the budget for failed repairs, an attempt may spend the part 1 / _SHARE of what is left.
-_SHARE = 4
-# If the search on the given mesh fails, a construction with at most this many added vertices is returned immediately.
-_MAX_ADDED_AT_ONCE = 1
+
+
+class AttemptLimits(NamedTuple):
+    """Limits of the attempts before and after a construction."""
+
+    # Limits of a search if a construction exists: iterations, and triangles times iterations for large meshes.
+    reduced_iterations: int = 600
+    reduced_work: int = 1_500_000
+    # Rounds of splitting around inverted triangles, with and without a construction.
+    reduced_rounds: int = 1
+    rounds: int = 3
+    # Of the budget for failed repairs, an attempt may spend the part 1 / `budget_divisor` of what is left.
+    budget_divisor: int = 4
+    # If the search on the given mesh fails, a construction with at most this many added vertices is returned
+    # immediately.
+    max_added_at_once: int = 1
+
+
+_LIMITS = AttemptLimits()
 
 
 def search_refining(problem: Problem, options: MapOptions) -> MapResult:
@@ -65,7 +75,7 @@ def search_refining(problem: Problem, options: MapOptions) -> MapResult:
 
     def search(on: Problem, first: FloatArray | None, budget: int, select: _Selection) -> MapResult:
         nonlocal left, repairs
-        share = repairs // _SHARE
+        share = repairs // _LIMITS.budget_divisor
         own = replace(
             options,
             strategy=select(stages_of(options.strategy, on)),
@@ -116,12 +126,12 @@ class _Refinement:
 
     def _run_attempts(self, start: FloatArray | None, budget: int) -> MapResult:
         problem = self._problem
-        reduced = min(budget, _REDUCED_ITERATIONS, 1 + _REDUCED_WORK // len(problem.F))
+        reduced = min(budget, _LIMITS.reduced_iterations, 1 + _LIMITS.reduced_work // len(problem.F))
         if not is_simple(problem):
             # If a straight side makes edges degenerate, a map seldom exists, and then only by a rounding error.
             first = self._search_on(AS_GIVEN, None, start, reduced if len(self._flat) else budget)
             # If refinement does not help, report the result on the given mesh.
-            return first if first.injective else self._split_edges_and_search(first, budget, _ROUNDS) or first
+            return first if first.injective else self._split_edges_and_search(first, budget, _LIMITS.rounds) or first
         self._select = quick_stages
         first = self._search_on(AS_GIVEN, None, start, budget)
         if first.injective:
@@ -134,9 +144,9 @@ class _Refinement:
             first = self._search_on(AS_GIVEN, None, start, reduced if made.injective else budget)
             if first.injective:
                 return first
-        if made.injective and made.added <= _MAX_ADDED_AT_ONCE:
+        if made.injective and made.added <= _LIMITS.max_added_at_once:
             return self._use_construction(made)
-        found = self._split_edges_and_search(first, reduced, _REDUCED_ROUNDS)
+        found = self._split_edges_and_search(first, reduced, _LIMITS.reduced_rounds)
         if found is not None and (not made.injective or found.added <= made.added):
             return found
         return self._use_construction(made)

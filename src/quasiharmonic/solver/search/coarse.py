@@ -7,6 +7,7 @@ factorisation or descent on the fine mesh.
 
 from __future__ import annotations
 
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,22 +18,28 @@ from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, mark, pad_to_space
 
-# Vertices of the coarse mesh, as a fraction of the fine mesh's.
-_SHARE = 1 / 8
-# Maximum number of vertices of the coarse mesh,
-_MAX_VERTICES = 1000
-# unless the fixed vertices, all of which are kept, require more. This many vertices per fixed vertex suffice to grade
-# the triangles from the boundary to the interior.
-_PER_FIXED = 3
-# Coarsening to this fraction of the vertices or more saves too little.
-_WORTHWHILE = 0.5
-# Meshes with fewer vertices are not coarsened, because searching them is fast.
-_MIN_VERTICES = 1500
-# Coarse triangles whose height is below this fraction of their longest side carry no useful shape, and their weights in
-# an energy exceed double precision.
-_MIN_HEIGHT = 1e-3
-# Corners of such triangles are moved by up to this fraction of the shortest edge there.
-_PERTURBATION = 0.2
+
+class CoarseTuning(NamedTuple):
+    """Numbers that tune the coarse mesh and its use."""
+
+    # Vertices of the coarse mesh, as a fraction of the fine mesh's.
+    share: float = 1 / 8
+    # Maximum number of vertices of the coarse mesh, unless the fixed vertices, all of which are kept, require more.
+    max_vertices: int = 1000
+    # This many vertices per fixed vertex suffice to grade the triangles from the boundary to the interior.
+    vertices_per_fixed: int = 3
+    # Coarsening to this fraction of the vertices or more saves too little.
+    worthwhile: float = 0.5
+    # Meshes with fewer vertices are not coarsened, because searching them is fast.
+    min_vertices: int = 1500
+    # Coarse triangles whose height is below this fraction of their longest side carry no useful shape, and their
+    # weights in an energy exceed double precision.
+    min_height: float = 1e-3
+    # Corners of such triangles are moved by up to this fraction of the shortest edge there.
+    perturbation: float = 0.2
+
+
+_TUNING = CoarseTuning()
 
 
 #: Coarse meshes of the domains in use; None if a domain has none.
@@ -73,8 +80,8 @@ def coarse_mesh(problem: Problem) -> CoarseMesh | None:
         return None
     fine = problem.domain
     if fine not in _COARSE_MESHES:
-        goal = int(max(_PER_FIXED * fine.fixed.size, min(_SHARE * fine.n, _MAX_VERTICES)))
-        worthwhile = fine.n >= _MIN_VERTICES and goal < _WORTHWHILE * fine.n
+        goal = int(max(_TUNING.vertices_per_fixed * fine.fixed.size, min(_TUNING.share * fine.n, _TUNING.max_vertices)))
+        worthwhile = fine.n >= _TUNING.min_vertices and goal < _TUNING.worthwhile * fine.n
         _COARSE_MESHES[fine] = CoarseMesh(fine, goal) if worthwhile else None
     return _COARSE_MESHES[fine]
 
@@ -86,7 +93,7 @@ def _perturb_flat(V: FloatArray, F: IntArray) -> FloatArray:
     """
     shapes = rest_shapes(V, F)
     lengths = np.abs(shapes.sides)
-    low = ~(2 * shapes.m >= _MIN_HEIGHT * lengths.max(axis=0) ** 2)
+    low = ~(2 * shapes.m >= _TUNING.min_height * lengths.max(axis=0) ** 2)
     if not low.any():
         return V
     space = pad_to_space(V)
@@ -95,6 +102,6 @@ def _perturb_flat(V: FloatArray, F: IntArray) -> FloatArray:
         for corner in ends:
             np.minimum.at(shortest, F[:, corner], np.where(length > 0, length, np.inf))
     corners = np.unique(F[low])
-    by = _PERTURBATION * shapes.unit * shortest[corners, None]
+    by = _TUNING.perturbation * shapes.unit * shortest[corners, None]
     space[corners] += by * np.random.default_rng(0).uniform(-1, 1, (corners.size, 3))
     return space

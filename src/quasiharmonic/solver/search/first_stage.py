@@ -234,7 +234,7 @@ def _join(batches: Sequence[_BatchDescent]) -> list[_BatchDescent]:
         part = chosen[first:last]
         triangles = np.concatenate([np.arange(ends[k] - members[k].size, ends[k]) for k in part])
         own = [members[k] for k in part]
-        joined.append(_BatchDescent(own, xi[triangles], adam.part(triangles), descent, patterns))
+        joined.append(_BatchDescent(own, xi[triangles], adam.take_part(triangles), descent, patterns))
     return joined
 
 

@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypedDict, Unpack, get_args
+from typing import Any, NamedTuple, TypedDict, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,13 +32,20 @@ from quasiharmonic.util.threads import count_cores, make_executor
 #: A problem as arrays: ``V, F, fixed, target`` as `quasiharmonic.Problem` takes them.
 Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 
-# Maximum size of a batch in groups. The unsolved problems of a batch are joined after the first iterations.
-_GROUPS = 4
-# A batch has at most one ``_PART``-th of the triangles before it (but may always have one group), so that no thread has
-# much left while the others are idle.
-_PART = 8
-# Seconds between two calls of the callback while no problem finishes, and between two checks for an interrupt.
-_TICK = 0.2
+
+class BatchTuning(NamedTuple):
+    """Numbers that tune batches of problems."""
+
+    # Maximum size of a batch in groups. The unsolved problems of a batch are joined after the first iterations.
+    groups: int = 4
+    # A batch has at most this part (1 / `divisor`) of the triangles before it, so that no thread has much left while
+    # the others are idle. It may always have one group.
+    divisor: int = 8
+    # Seconds between two calls of the callback while no problem finishes, and between two checks for an interrupt.
+    tick: float = 0.2
+
+
+_TUNING = BatchTuning()
 
 
 class ManyKeywords(TypedDict, total=False):
@@ -180,7 +187,7 @@ def _wait_for(
     """Wait for the results of a group; meanwhile call the callback regularly and allow Ctrl-C."""
     while True:
         try:
-            return future.result(timeout=_TICK)
+            return future.result(timeout=_TUNING.tick)
         except NotYet:
             if callback is not None:
                 callback(done)
@@ -191,7 +198,7 @@ def _group_problems(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
     first, group, size, before = 0, list[Any](), 0, 0
     for given in problems:
         triangles = _count_triangles(given)
-        limit = GROUP * min(max(before // (_PART * GROUP), 1), _GROUPS)
+        limit = GROUP * min(max(before // (_TUNING.divisor * GROUP), 1), _TUNING.groups)
         if group and (size + triangles > limit or triangles > SMALL):
             yield first, group
             before += size

@@ -105,7 +105,7 @@ class SearchRecord:
     def state(self, state: BestMap) -> None:
         self.best, self.best_map, self.best_field, self.best_reference, self.lowest_energy = state
 
-    def visit(self, here: Iterate, inverted: int, *, tensors: bool) -> None:
+    def record_iterate(self, here: Iterate, inverted: int, *, tensors: bool) -> None:
         """Record an iterate with this number of inverted triangles, and update the best map.
 
         If ``tensors``, it comes from a tensor descent.
@@ -152,13 +152,13 @@ class StageRun:
         if self.search.repairs.left <= 0:
             self.status = Status.STALLED
 
-    def visit(self, here: Iterate, inverted: int) -> None:
+    def record_iterate(self, here: Iterate, inverted: int) -> None:
         """Record a new map with ``inverted`` inverted triangles; set ``status`` if the stage ends with it."""
         if self._last is None:
             # Compare the very first stage with its own initial map.
             self._before = (here.inverted, here.energy) if self.search.best_field is None else self.search.best
         self._last = here.w
-        self.search.visit(here, inverted, tensors=not self.stage.moves_vertices)
+        self.search.record_iterate(here, inverted, tensors=not self.stage.moves_vertices)
         if inverted == 0:
             self.status = Status.INJECTIVE
         elif self.search.left <= 0:
@@ -203,7 +203,7 @@ def visit_rounds(rounds: Iterable[Round]) -> None:
         # Check the returned coordinates, not those of the solver.
         exact = iter(count_not_positive([(run.search.problem, here.w) for run, here in new if here.inverted == 0]))
         for run, here in new:
-            run.visit(here, here.inverted or next(exact))
+            run.record_iterate(here, here.inverted or next(exact))
 
 
 def single_rounds(run: StageRun, objective: Objective, start: Iterate) -> Iterator[Round]:

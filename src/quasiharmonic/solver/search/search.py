@@ -44,10 +44,6 @@ _FAILED_REPAIRS, _FAILED_REPAIRS_OF_TOUCHING = 16, 2
 LOCAL_REPAIRS = LineShift(resume=True), LocalRepair(tries=15, resume=True)
 # Stages that follow the first stage on a coarse mesh.
 _COARSE_STAGES = *LOCAL_REPAIRS, Untangling(resume=True), *LOCAL_REPAIRS
-# Newton steps towards the map of least area if no injective map exists; later steps cause no visible change.
-_AREA_STEPS = 30
-# Newton steps on a coarse map. Fine vertices crowd in thin coarse triangles, so a few steps avoid much later work.
-_POLISHING_STEPS = 3
 
 
 def allowed_repairs(problem: Problem, max_iterations: int) -> int:
@@ -223,8 +219,10 @@ class Search(SearchRecord):
 
     def _minimise_area(self) -> None:
         """Move to the map of least area, which is the target's area plus V₃ (eq. 42)."""
+        # Newton steps towards the map of least area if no injective map exists; later steps cause no visible change.
+        area_steps = 30
         if self.left > 0:
-            self._descend(Newton(iterations=_AREA_STEPS, resume=True))
+            self._descend(Newton(iterations=area_steps, resume=True))
         if self.lowest_energy is not None:
             here = self.lowest_energy
             self.best_map, self.best_field, self.best_reference = here.w, here.field, here.objective.reference
@@ -235,11 +233,13 @@ def search_coarse(problem: Problem, first: Descent, options: MapOptions) -> tupl
 
     Return the status, the map (n, 2), its number of inverted triangles and the linear solver used.
     """
+    # Newton steps on a coarse map. Fine vertices crowd in thin coarse triangles, so a few steps avoid much later work.
+    polishing_steps = 3
     search = Search(problem, options)
     status = search.run([first, *_COARSE_STAGES])
     uv = problem.positions(search.best_map)
     if status is Status.INJECTIVE:
-        polishing = PolishOptions(energy="mips", max_iterations=_POLISHING_STEPS, linear_solver=options.linear_solver)
+        polishing = PolishOptions(energy="mips", max_iterations=polishing_steps, linear_solver=options.linear_solver)
         status = Status.INTERRUPTED
         with search.work.until_interrupted():
             polish = polish_map(problem.domain, uv, polishing)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import takewhile
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Status
@@ -34,17 +34,23 @@ Stages: TypeAlias = Sequence[SearchStage]
 
 # Fraction of inverted triangles above which a stage `IfManyInverted` runs.
 MANY_INVERTED = 0.02
-# Number of vertices from which a coarse-to-fine start pays. Making, solving and refining the coarse mesh is then faster
-# than ten iterations on the fine mesh.
-_COARSE_FROM = 6000
-# Number of triangles from which wide patches are tried before the whole mesh is untangled.
-_WIDE_FROM = 4000
-# Up to this number of triangles the composite costs more time than it saves,
-_COMPOSITE_FROM = 1000
-# and up to this number of triangles per boundary edge.
-_COMPOSITE_FROM_PER_EDGE = 4
-# Repetitions of alternation and Newton's method in the paper's pipeline.
-_REPETITIONS = 10
+
+
+class StageThresholds(NamedTuple):
+    """Sizes of problems from which stages run."""
+
+    # Number of vertices from which a coarse-to-fine start pays. Making, solving and refining the coarse mesh is then
+    # faster than ten iterations on the fine mesh.
+    coarse: int = 6000
+    # Number of triangles from which wide patches are tried before the whole mesh is untangled.
+    wide: int = 4000
+    # Up to this number of triangles the composite costs more time than it saves.
+    composite: int = 1000
+    # The same number per boundary edge.
+    composite_per_edge: int = 4
+
+
+_THRESHOLDS = StageThresholds()
 
 
 @dataclass(frozen=True)
@@ -117,8 +123,8 @@ def speed(problem: Problem) -> Stages:
     domain = problem.domain
     pinned, triangles = bool(domain.pins.size), len(problem.F)
     is_disk = len(domain.loops) == 1 and not pinned
-    composed = is_disk and triangles > max(_COMPOSITE_FROM, _COMPOSITE_FROM_PER_EDGE * domain.loops[0].size)
-    return list(_speed(pinned, is_disk, composed, problem.n >= _COARSE_FROM, triangles >= _WIDE_FROM))
+    composed = is_disk and triangles > max(_THRESHOLDS.composite, _THRESHOLDS.composite_per_edge * domain.loops[0].size)
+    return list(_speed(pinned, is_disk, composed, problem.n >= _THRESHOLDS.coarse, triangles >= _THRESHOLDS.wide))
 
 
 @cache
@@ -169,6 +175,8 @@ def paper(_: Problem) -> Stages:
     surface's triangles as reference and angles below π/6 corrected (§F.1). The paper does not give the iterations of
     tanh and of each turn; those used here add up to 2000. The steps are the defaults of `VectorAdam`.
     """
+    # Repetitions of alternation and Newton's method in the paper's pipeline.
+    repetitions = 10
     turn: list[SearchStage] = [
         TentativeStage(Alternating(reference="corrected", iterations=20, resume=True)),
         Newton(reference="corrected", iterations=20, resume=True),
@@ -176,7 +184,7 @@ def paper(_: Problem) -> Stages:
     return [
         VectorAdam(parameterisation="si-log", reference="corrected", iterations=1000),
         VectorAdam(reference="corrected", iterations=600),
-        *_REPETITIONS * turn,
+        *repetitions * turn,
     ]
 
 

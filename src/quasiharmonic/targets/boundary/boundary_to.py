@@ -27,9 +27,6 @@ from quasiharmonic.targets.outlines.contours import NestedContour, arrange, fill
 from quasiharmonic.targets.specification import outline as specified
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, count_of, describe, to_complex
 
-# Number of choices per loop for which the full energy is computed.
-_CANDIDATES = 8
-
 
 def match_holes(
     surface: Domain, outer: int, positions: FloatArray, contours: list[FloatArray], to: Mapping[int, int]
@@ -63,6 +60,8 @@ def choose_least_stretch(
     points, needs one solve for all choices. It selects the few most promising choices, for which the whole form is
     computed. Then each loop in turn takes its best choice until none changes.
     """
+    # Number of choices per loop for which the full energy is computed.
+    candidates = 8
     loops = surface.loops
     if all(len(positions) == 1 for positions in choices.values()):
         return {i: positions[0] for i, positions in choices.items()}
@@ -89,7 +88,7 @@ def choose_least_stretch(
     kept, answers, own = {}, {}, {}
     for i in choices:
         linear = 2 * work(i, offsets[i], pull)
-        kept[i] = np.argsort(linear, kind="stable")[:_CANDIDATES]
+        kept[i] = np.argsort(linear, kind="stable")[:candidates]
         offsets[i] = [offsets[i][k] for k in kept[i]]
         answers[i] = [forces({i: offset}) for offset in offsets[i]]
         # The quadratic part of each choice by itself.

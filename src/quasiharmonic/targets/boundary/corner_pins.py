@@ -40,8 +40,6 @@ from quasiharmonic.util.arrays import (
 )
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
-# Maximum loss of similarity, relative to the best value (2 at most), that is accepted for an upright map.
-_SIMILAR = 0.1
 
 #: Forms of corners on the command line.
 FORMS = "V, V:K and V:X:Y, where near:x,y,z may stand for the vertex V"
@@ -214,6 +212,8 @@ def pins_by_angle(
     result has positions in the loop and parameters from 0 to 1 along the contour, in order around. ValueError when the
     loop has fewer vertices than the contour has corners.
     """
+    # Maximum loss of similarity, relative to the best value (2 at most), that is accepted for an upright map.
+    similar = 0.1
     sharp = corners_of(contour, corner_angle)
     if not sharp.size:
         return []
@@ -226,7 +226,7 @@ def pins_by_angle(
     alike += _likeness(_measure_gaps(runs) + 0j, _measure_gaps(ends) + 0j)
     seen, goal = to_complex(flat[positions]), to_complex(contour[sharp])
     upright = _likeness(seen - seen.mean(), goal - goal.mean())
-    first = int(np.argmax(np.where(alike >= alike.max() - _SIMILAR, upright, -np.inf)))
+    first = int(np.argmax(np.where(alike >= alike.max() - similar, upright, -np.inf)))
     return list(zip(np.roll(positions, -first).tolist(), ends.tolist(), strict=True))
 
 

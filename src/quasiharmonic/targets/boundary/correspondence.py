@@ -82,7 +82,7 @@ def places_along(
     sharp = corners(contour, corner_angle)
     place = np.empty(len(s))
     for stretch in stretches(s, pins):
-        here, wanted = stretch.within(t, sharp)
+        here, wanted = stretch.find_inside(t, sharp)
         run, along, count = stretch.run, stretch.along, len(stretch.run) - 1
         if count - 1 < len(here):
             raise _too_few(names[run[0]], names[run[-1]], count - 1, len(here))
@@ -112,7 +112,7 @@ class BoundaryStretch:
     begin: float  # Parameter of the first pin along the contour
     gap: float  # Distance along the contour from the first pin to the last
 
-    def within(self, t: FloatArray, some: IntArray) -> tuple[IntArray, FloatArray]:
+    def find_inside(self, t: FloatArray, some: IntArray) -> tuple[IntArray, FloatArray]:
         """Return the given contour points strictly inside this stretch, in order, with local parameters from 0 to 1."""
         local = (t[some] - self.begin) % 1.0 / self.gap
         order = np.argsort(local)

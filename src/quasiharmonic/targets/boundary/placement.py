@@ -44,8 +44,6 @@ from quasiharmonic.util.arrays import (
     vertex_names,
 )
 
-# Minimum left turn in radians, larger than that of a rounded straight line.
-_MIN_TURN = 1e-9
 # Maximum shift of a vertex to a corner, as a share of the loop. Beyond it, the target no longer resembles the surface,
 # and splitting edges is better.
 FARTHEST = 0.2
@@ -62,14 +60,16 @@ def clear_chords(
     the ``pins`` and the chosen vertices with their corners, in order around. It is None if no choice leaves space for
     all chords, or only one that shifts a vertex by more than a fifth of the loop. Chords across a pin are ignored.
     """
+    # Minimum left turn in radians, larger than that of a rounded straight line.
+    min_turn = 1e-9
     t, bends = arc_parameters(contour), turns(contour)
     sharp = corners(contour, corner_angle)
-    left = np.flatnonzero(bends > _MIN_TURN)
+    left = np.flatnonzero(bends > min_turn)
     found: list[tuple[int, float]] = []
     for stretch in stretches(s, pins):
-        here, wanted = stretch.within(t, sharp[bends[sharp] > 0])
-        spare = _find_between(wanted, stretch.within(t, sharp[bends[sharp] < 0])[1])
-        straight = _find_between(wanted, stretch.within(t, left)[1]) == 0
+        here, wanted = stretch.find_inside(t, sharp[bends[sharp] > 0])
+        spare = _find_between(wanted, stretch.find_inside(t, sharp[bends[sharp] < 0])[1])
+        straight = _find_between(wanted, stretch.find_inside(t, left)[1]) == 0
         conditions = ChordConditions(reach(stretch, chords, len(s)), straight, spare, FARTHEST / stretch.gap)
         chosen = choose(stretch.along, wanted, conditions)
         if chosen is None:

@@ -36,11 +36,6 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 
-# Maximum number of passes of moves. The first few give nearly all of the decrease.
-_MAX_ROUNDS = 50
-# Minimum relative decrease of the sum for a move, larger than rounding errors.
-_MIN_DECREASE = 1e-9
-
 
 @dataclass(frozen=True, eq=False)
 class BoundaryLoop:
@@ -263,11 +258,15 @@ def _remove_until(lengths: FloatArray, turning: FloatArray, count: int) -> IntAr
 
 def _improve(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> IntArray:
     """Move each corner to the best vertex between its neighbours until all corners have converged."""
+    # Minimum relative decrease of the sum for a move, larger than rounding errors.
+    min_decrease = 1e-9
+    # Maximum number of passes of moves. The first few give nearly all of the decrease.
+    max_rounds = 50
     n, count = len(lengths), len(corners)
     if count == 1:
         return corners
     corners = corners.copy()
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(max_rounds):
         before = corners.copy()
         for j in range(count):
             first = int(corners[j - 1])
@@ -278,7 +277,7 @@ def _improve(lengths: FloatArray, turning: FloatArray, corners: IntArray) -> Int
             so_far, along = np.cumsum(length * direction)[:-1], np.cumsum(length)[:-1]
             lowered = so_far**2 * length.sum() / (along * (length.sum() - along))
             here, best = (int(corners[j]) - first) % n - 1, int(np.argmax(lowered))
-            if lowered[best] > lowered[here] + _MIN_DECREASE * (length * direction**2).sum():
+            if lowered[best] > lowered[here] + min_decrease * (length * direction**2).sum():
                 corners[j] = run[best + 1]
         if np.array_equal(corners, before):
             break

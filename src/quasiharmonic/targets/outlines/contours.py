@@ -24,8 +24,6 @@ Pieces = list[FloatArray]
 
 # Limit that protects against malicious files; no real outline needs more.
 MAX_POINTS = 1_000_000
-# Maximum number of meeting sides to find; the first is reported.
-_MAX_MEETINGS = 100
 
 
 def signed_area(contour: ArrayLike) -> float:
@@ -231,8 +229,10 @@ def is_collinear(contour: FloatArray) -> bool:
 
 def _check_simple(curves: LoopEdges, points: FloatArray) -> None:
     """Raise if two sides of contours share more than the point that joins them."""
+    # Maximum number of meeting sides to find; the first is reported.
+    max_meetings = 100
     start, owner, following = curves.start, curves.owner, curves.following
-    met = contacts(points, curves.ends, _MAX_MEETINGS)
+    met = contacts(points, curves.ends, max_meetings)
     if not len(met.pairs):
         return
     # A side that doubles back also touches neighbouring sides, so report spikes first.
@@ -247,7 +247,7 @@ def _check_simple(curves: LoopEdges, points: FloatArray) -> None:
 
     how = {SegmentRelation.CROSSING: "crosses", SegmentRelation.TOUCHING: "touches"}.get(relation, "runs along")
     one, other = int(owner[i]), int(owner[j])
-    count = f"{len(met.pairs)} such pairs in all" if met.complete else f"more than {_MAX_MEETINGS} such pairs"
+    count = f"{len(met.pairs)} such pairs in all" if met.complete else f"more than {max_meetings} such pairs"
     more = f" ({count})" if len(met.pairs) > 1 else ""
     if spike[first]:
         at = j if following[i] == j else i

@@ -10,7 +10,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,16 +25,25 @@ _FONT_FILES = ".ttf", ".otf", ".ttc"
 
 #: Overlap of each letter with the one before, in units of the font size, by default.
 OVERLAP = 0.03
-# Points of a united outline closer than this, in units of the font size, are merged.
-_SAME_POINT = 1e-12
-# Maximum number of Newton steps to the intersection of two curves.
-_MAX_STEPS = 30
-# Tolerance of the intersection, as a share of the curve's size.
-_MEETING_TOLERANCE = 1e-14
-# Maximum relative difference between the lengths of a curve and its chords.
-_LENGTH_DIFFERENCE = 0.01
-# Where chords cross at a small angle, the curves may intersect at this distance from there, in tolerances.
-_MAX_DISTANCE = 100.0
+
+
+class MeetingTuning(NamedTuple):
+    """Numbers that tune the search for the meeting points of letters."""
+
+    # Points of a united outline closer than this, in units of the font size, are merged.
+    same_point: float = 1e-12
+    # Maximum number of Newton steps to the intersection of two curves.
+    max_steps: int = 30
+    # Tolerance of the intersection, as a share of the curve's size.
+    tolerance: float = 1e-14
+    # Maximum relative difference between the lengths of a curve and its chords.
+    length_difference: float = 0.01
+    # Where chords cross at a small angle, the curves may intersect at this distance from there, in tolerances.
+    max_distance: float = 100.0
+
+
+_TUNING = MeetingTuning()
+
 _TANGENT_LETTERS = (
     "letters of the word are almost tangent where they touch, so their curves cannot be joined: choose other letters, "
     "or slide the boundary along a polygon"
@@ -233,7 +242,7 @@ def word_curves(text: str, font: Font | None, tolerance: float) -> list[Curve]:
         for path in glyph_paths(character, font)
         if any(np.ptp(piece, axis=0).any() for piece in path)
     ]
-    return [_trace(drop_close_points(contour, _SAME_POINT), drawn, tolerance) for contour in _unite(letters)]
+    return [_trace(drop_close_points(contour, _TUNING.same_point), drawn, tolerance) for contour in _unite(letters)]
 
 
 def _place_letters(
@@ -279,7 +288,11 @@ def _trace(contour: FloatArray, drawn: list[Curve], tolerance: float) -> Curve:
     found = Curve(pieces)
     around = float(np.hypot(*(np.roll(contour, -1, axis=0) - contour).T).sum())
     away = float(found.nearest(contour)[1].max())
-    if not found.closed or abs(found.length - around) > _LENGTH_DIFFERENCE * around or away > _MAX_DISTANCE * tolerance:
+    if (
+        not found.closed
+        or abs(found.length - around) > _TUNING.length_difference * around
+        or away > _TUNING.max_distance * tolerance
+    ):
         raise ValueError(_TANGENT_LETTERS)
     return found
 
@@ -288,9 +301,9 @@ def _find_meeting(one: Curve, other: Curve, near: FloatArray) -> tuple[float, fl
     """Intersection of two curves near a point, as arc lengths along each, by Newton's method."""
     s, t = (curve.nearest(near[None])[0] for curve in (one, other))
     ahead = np.ones(1, dtype=bool)
-    for _ in range(_MAX_STEPS):
+    for _ in range(_TUNING.max_steps):
         apart = ((other.position(t) - one.position(s)) @ (1, 1j))[0]
-        if abs(apart) <= _MEETING_TOLERANCE * one.size:
+        if abs(apart) <= _TUNING.tolerance * one.size:
             return float(s[0]), float(t[0])
         along, across = one.frame(s, ahead)[0][0], other.frame(t, ahead)[0][0]
         sine = (along.conjugate() * across).imag

@@ -286,7 +286,7 @@ def describe_off_outline(curves: BoundaryCurves, island: Island) -> list[str]:
     from quasiharmonic.util.arrays import names_of
 
     loops = boundary_loops(island.F, len(island.V))
-    off = island.vertices[curves.off(loops, island.uv)]
+    off = island.vertices[curves.find_off_curves(loops, island.uv)]
     if not off.size:
         return []
     count = sum(loop.size for loop in loops)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,14 +43,21 @@ from quasiharmonic.util.arrays import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Size of the numbers in points.
-_FONT_SIZE = 7.5
-# Width of a digit, in units of the font size.
-_DIGIT_WIDTH = 0.68
-# Height of a number, in the same units.
-_NUMBER_HEIGHT = 1.25
-# Distance of a number from its vertex, in the same units.
-_NUMBER_DISTANCE = 0.3
+
+class NumberStyle(NamedTuple):
+    """Sizes of the numbers at vertices, in units of the font size."""
+
+    # Font size in points.
+    font_size: float = 7.5
+    # Width of a digit.
+    digit_width: float = 0.68
+    # Height of a number.
+    height: float = 1.25
+    # Distance of a number from its vertex.
+    distance: float = 0.3
+
+
+_NUMBERS = NumberStyle()
 
 
 @writer_accepts_mesh
@@ -95,12 +102,13 @@ def save_boundary_figure(
     ax.plot(*seen.points[marked].T, "o", color=RED, markersize=5, zorder=6)
     border = np.concatenate([marked, *(loop[~np.isin(loop, marked)] for loop in loops)])
     digits = np.array([len(str(vertex)) for vertex in border.tolist()])
-    half = _FONT_SIZE / 2 * np.stack([_DIGIT_WIDTH * (digits + 1), np.full(len(digits), _NUMBER_HEIGHT)], axis=1)
-    centres = scale * seen.points[border] + (half + _NUMBER_DISTANCE * _FONT_SIZE) * _outward(seen.points, F, border)
+    size = np.stack([_NUMBERS.digit_width * (digits + 1), np.full(len(digits), _NUMBERS.height)], axis=1)
+    half, gap = _NUMBERS.font_size / 2 * size, _NUMBERS.distance * _NUMBERS.font_size
+    centres = scale * seen.points[border] + (half + gap) * _outward(seen.points, F, border)
     for k in _find_readable(centres, half):
         color = RED if k < len(marked) else INK
         x, y = centres[k] / scale
-        ax.text(x, y, str(border[k]), size=_FONT_SIZE, color=color, ha="center", va="center", zorder=7)
+        ax.text(x, y, str(border[k]), size=_NUMBERS.font_size, color=color, ha="center", va="center", zorder=7)
     count, many = sum(len(loop) for loop in loops), "" if len(loops) == 1 else "s"
     caption(ax, f"{count:,} boundary vertices in {len(loops)} loop{many}; corners in red")
     save_picture(path, figure)

@@ -7,7 +7,7 @@ from base64 import b64encode
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,17 +25,26 @@ if TYPE_CHECKING:
 
     from quasiharmonic.io import MeshData
 
-_BINS_PER_DECADE = 6
+
+class ChartSizes(NamedTuple):
+    """Sizes of charts."""
+
+    # Number of bins of a histogram per factor of ten.
+    bins_per_decade: int = 6
+    # Sizes in pixels of the SVG.
+    font: int = 13
+    width: int = 640
+    height: int = 400
+    # Maximum number of triangles in a picture; drawing that many takes about one second.
+    max_triangles: int = 100_000
+
+
+_SIZES = ChartSizes()
+
 # Matplotlib draws with these colours; in the SVG the style sheet's variables replace them.
 _COLORS = {"ours": "#2463c8", "theirs": "#c26a00", "failed": "#c2182c", "quiet": "#5d6878", "line": "#dde2ea"}
 _QUIET = _COLORS["quiet"]
-# Sizes in pixels of the SVG.
-_FONT_SIZE = 13
-_WIDTH = 640
-_HEIGHT = 400
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-# Maximum number of triangles; drawing that many takes about one second.
-_MAX_TRIANGLES = 100_000
 
 
 def power(exponent: int) -> str:
@@ -54,7 +63,7 @@ def histogram(series: list[tuple[str, FloatArray]], label: str) -> str:
 
     finite = [(color, values[np.isfinite(values)]) for color, values in series]
     low, high = _decades([values for _, values in finite], least=1e-6)
-    edges = np.logspace(low, high, (high - low) * _BINS_PER_DECADE + 1)
+    edges = np.logspace(low, high, (high - low) * _SIZES.bins_per_decade + 1)
     figure, axes = _chart(label, "share of the maps")
     _use_decades(axes, "x", low, high)
     for k, (color, values) in enumerate(finite):
@@ -87,7 +96,7 @@ def scatter(series: list[tuple[str, FloatArray, FloatArray]], x_label: str, y_la
         start = 10.0 ** (low + exponent), 10.0**low
         axes.plot((start[0], 10.0**high), (start[1], 10.0 ** (high - exponent)), "--", color=_QUIET, linewidth=1)
         label, place = f"{10**exponent} ×", (34, 5)
-        axes.annotate(label, start, place, textcoords="offset pixels", color=_QUIET, size=_FONT_SIZE)
+        axes.annotate(label, start, place, textcoords="offset pixels", color=_QUIET, size=_SIZES.font)
     count = sum(map(len, xs))
     for color, xy in dots:
         # One dot per pixel at most. A dot is a very short line with round ends, because a marker takes more bytes.
@@ -113,15 +122,15 @@ def _chart(x_label: str, y_label: str) -> tuple[Figure, Axes]:
     """Return an empty chart."""
     from quasiharmonic.ui.plot.canvas import new_figure
 
-    figure = new_figure((_WIDTH / 72, _HEIGHT / 72))
+    figure = new_figure((_SIZES.width / 72, _SIZES.height / 72))
     figure.set_dpi(72)
     figure.patch.set_visible(False)
     axes = figure.add_axes((0.1, 0.13, 0.87, 0.83), facecolor="none", axisbelow=True)
-    axes.set_xlabel(x_label, color=_QUIET, size=_FONT_SIZE)
-    axes.set_ylabel(y_label, color=_QUIET, size=_FONT_SIZE)
+    axes.set_xlabel(x_label, color=_QUIET, size=_SIZES.font)
+    axes.set_ylabel(y_label, color=_QUIET, size=_SIZES.font)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(_QUIET)
-    axes.tick_params(length=0, pad=6, labelcolor=_QUIET, labelsize=_FONT_SIZE)
+    axes.tick_params(length=0, pad=6, labelcolor=_QUIET, labelsize=_SIZES.font)
     axes.grid(color=_COLORS["line"])
     return figure, axes
 
@@ -146,7 +155,7 @@ def _svg(figure: Figure) -> str:
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "quasiharmonic", "path.simplify": False}):
         figure.savefig(file, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
     drawing = re.sub(r' id="[^"]*"', "", file.getvalue().partition("</defs>")[2])
-    text = f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img">{drawing}'
+    text = f'<svg viewBox="0 0 {_SIZES.width} {_SIZES.height}" role="img">{drawing}'
     for name, color in _COLORS.items():
         text = text.replace(color, f"var(--{name})")
     return text
@@ -156,10 +165,10 @@ def thumbnail(record: Record, results: Path | None) -> str:
     """Draw the surface of a record and, if it exists, its map: a ``data:`` address of a PNG, empty if nothing can be
     drawn.
     """
-    if (record.get("triangles") or 0) > _MAX_TRIANGLES:
+    if (record.get("triangles") or 0) > _SIZES.max_triangles:
         return ""
     mesh, mapped = _read(record, results)
-    if mesh is None or not len(mesh.F) or len(mesh.F) > _MAX_TRIANGLES:
+    if mesh is None or not len(mesh.F) or len(mesh.F) > _SIZES.max_triangles:
         return ""
     from quasiharmonic.ui.plot import plot_map, plot_surface
     from quasiharmonic.ui.plot.canvas import new_figure, panels, png_bytes

@@ -11,7 +11,7 @@ from html import escape
 from importlib.resources import files
 from math import isfinite, isnan
 from string import Template
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -27,12 +27,19 @@ STYLE = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
 _PAGE = Template(files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
 
 
-# Maximum number of problems per list of certified maps.
-_PICTURES = 12
-# Maximum number of failures with a picture.
-_FAILURES = 24
-# Maximum number of failures that are listed.
-_MAX_LISTED = 500
+class ListLimits(NamedTuple):
+    """Maximum lengths of the lists of a report."""
+
+    # Problems per list of certified maps.
+    pictures: int = 12
+    # Failures with a picture.
+    failures: int = 24
+    # Failures that are listed.
+    listed: int = 500
+
+
+_LIMITS = ListLimits()
+
 # A function from a record to the ``data:`` address of its picture, or an empty string.
 Draw: TypeAlias = Callable[[Record], str]
 
@@ -167,7 +174,7 @@ def _groups(run: BatchRun) -> str:
 
 def _describe_unwraps(run: BatchRun) -> str:
     """Return a table of the charts of unwrapped models, those with most charts first; empty for maps."""
-    rows = _find_worst(run, "charts", _MAX_LISTED)
+    rows = _find_worst(run, "charts", _LIMITS.listed)
     if not rows:
         return ""
     lines = [
@@ -189,8 +196,8 @@ def _describe_unwraps(run: BatchRun) -> str:
         f"Medians: {count} charts, stretch {stretch}, {use} of the texture used. "
         f"{cleaned:,} of {len(run.rows):,} models were cleaned."
     )
-    if len(run.rows) > _MAX_LISTED:
-        words += f" The table of records lists more than these {_MAX_LISTED}."
+    if len(run.rows) > _LIMITS.listed:
+        words += f" The table of records lists more than these {_LIMITS.listed}."
     head = "model", "charts", "seam length", "stretch of 99 %", "used texture", "cleaned"
     return f"<h2>Charts</h2><p>{words}</p>{_table(head, lines)}"
 
@@ -254,7 +261,7 @@ def _phases(run: BatchRun) -> str:
     return f'<section class="card"><h2>Time by phase</h2>{table}</section>'
 
 
-def _find_worst(run: BatchRun, column: str, most: int = _PICTURES) -> list[Record]:
+def _find_worst(run: BatchRun, column: str, most: int = _LIMITS.pictures) -> list[Record]:
     """Return the certified records with the highest values in a column, in decreasing order."""
     values = np.where(run.certified, run.column(column), np.nan)
     order = np.argsort(-values, kind="stable")
@@ -298,12 +305,12 @@ def _failures(run: BatchRun, draw: Draw) -> str:
     rows = [row for row in run.rows if row.get("certified") is not True]
     if not rows:
         return "<h2>Failed</h2><p>None.</p>"
-    parts = [_gallery(f"Failed ({len(rows):,})", draw, rows[:_FAILURES])]
-    rest = rows[_FAILURES:_MAX_LISTED]
+    parts = [_gallery(f"Failed ({len(rows):,})", draw, rows[: _LIMITS.failures])]
+    rest = rows[_LIMITS.failures : _LIMITS.listed]
     if rest:
         parts.append(_table(("problem", "triangles", "time", "reason"), [_line(row) for row in rest]))
-    if len(rows) > _MAX_LISTED:
-        parts.append(f"<p>And {len(rows) - _MAX_LISTED:,} more; the table of records lists them.</p>")
+    if len(rows) > _LIMITS.listed:
+        parts.append(f"<p>And {len(rows) - _LIMITS.listed:,} more; the table of records lists them.</p>")
     return "".join(parts)
 
 

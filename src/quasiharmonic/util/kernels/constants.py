@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-#: Name in C: Python file below the package folder, and the name there without its leading underscore.
+#: Name in C: Python file below the package folder. Its constant or field has the same name, up to case and underscore.
 SHARED = {
     "TINY": "solver/field/tensor.py",
     "TANH_BOUND": "solver/field/tensor.py",
@@ -44,13 +44,17 @@ def shared_constants(package: Path) -> dict[str, object]:
 
 
 def _assignments(text: str) -> dict[str, object]:
-    """Return the top-level constants of a Python file by name, without leading underscores."""
+    """Return the constants of a Python file and the defaults of fields, in capitals."""
     values: dict[str, object] = {}
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+    body = ast.parse(text).body
+    fields = [field for node in body if isinstance(node, ast.ClassDef) for field in node.body]
+    for node in [*fields, *body]:
+        target = node.target if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [None])[0]
+        value = getattr(node, "value", None)
+        if isinstance(target, ast.Name) and isinstance(value, ast.expr):
             try:
-                code = compile(ast.Expression(node.value), "constant", "eval")
-                values[node.targets[0].id.lstrip("_")] = eval(code, {"__builtins__": {}})
+                code = compile(ast.Expression(value), "constant", "eval")
+                values[target.id.lstrip("_").upper()] = eval(code, {"__builtins__": {}})
             except Exception:
                 continue
     return values

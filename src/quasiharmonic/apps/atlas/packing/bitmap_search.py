@@ -8,9 +8,7 @@ from math import ceil, pi, sqrt
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.packing.bitmaps import HALF_DIAGONAL, draw, draw_in_place
-from quasiharmonic.apps.atlas.packing.board import Bitmaps, Board
-from quasiharmonic.apps.atlas.packing.contact import Spot
+from quasiharmonic.apps.atlas.packing.board import HALF_DIAGONAL, Bitmaps, Board, Spot, draw, draw_in_place
 from quasiharmonic.apps.atlas.packing.shapes import Shape
 from quasiharmonic.util.arrays import ComplexArray, IntArray
 from quasiharmonic.util.progress import heartbeat
@@ -30,8 +28,6 @@ BITMAPS = 500
 _FEWEST_CELLS, MORE_CELLS = 0.8, 1.25
 #: Placements tried with other orders of the charts, in all.
 TRIALS = 120
-# Spread of the logarithm of the areas by which charts are ordered in these trials.
-_SPREAD = 0.3
 # Relative precision of the scale of few charts, at first, and of many.
 _MEDIUM, _COARSE = 0.03, 0.04
 
@@ -130,6 +126,8 @@ class BitmapSearch:
 
         Return the layout on it, and the order of the shapes.
         """
+        # Spread of the logarithm of the areas by which charts are ordered in these trials.
+        spread = 0.3
         best, high = self._scan(least, _MEDIUM)
         if best is None:
             return None
@@ -137,7 +135,7 @@ class BitmapSearch:
             best, high = found, high - 1
         generator, best_order = np.random.default_rng(0), self._order
         for _ in range(trials // len(self.areas)):
-            order = np.argsort(-self.areas * np.exp(generator.normal(0, _SPREAD, len(self.areas))), kind="stable")
+            order = np.argsort(-self.areas * np.exp(generator.normal(0, spread, len(self.areas))), kind="stable")
             parts = generator.integers(0, 3, len(self.areas))
             while (found := self.place_in(high - 1, order, parts)) is not None:
                 high, best, best_order = high - 1, found, order

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from math import ceil
+from math import ceil, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.packing.contact import Spot, find_most_contact, list_runs
-from quasiharmonic.apps.atlas.packing.rows import fill_rows
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
+from quasiharmonic.apps.atlas.packing.shapes import Shape
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, enumerate_each
+from quasiharmonic.util.kernels import compiled
 
 # Side, first row and first column.
 Window = tuple[int, int, int]
 
-# Largest side of the board of larger cells on which large bitmaps are placed.
-_COARSE = 256
-# Sides of windows. Windows overlap by half, so that a bitmap of almost half the side is in one window, wherever it is.
-_WINDOWS = 64, 128
-# A window without a free position is searched again for bitmaps with less than this share of the cells.
-_SMALLER = 0.8
+
+class BoardTuning(NamedTuple):
+    """Sizes of the boards and windows of the search."""
+
+    # Largest side of the board of larger cells on which large bitmaps are placed.
+    coarse: int = 256
+    # Sides of windows. Windows overlap by half, so that a bitmap of almost half the side is in one window, wherever it
+    # is.
+    windows: tuple[int, ...] = (64, 128)
+    # A window without a free position is searched again for bitmaps with less than this share of the cells.
+    smaller: float = 0.8
+
+
+_TUNING = BoardTuning()
 
 
 class Bitmaps:
@@ -58,9 +67,9 @@ class Board:
 
     def __init__(self, rows: int, columns: int, *, windows: bool) -> None:
         self.rows, self.columns = rows, columns
-        self._sizes = _WINDOWS if windows else ()
+        self._sizes = _TUNING.windows if windows else ()
         # Cells outside the board count as occupied.
-        outside = _WINDOWS[-1] if windows else 1
+        outside = _TUNING.windows[-1] if windows else 1
         self._cells = np.ones((rows + 1 + outside, columns + 1 + outside), dtype=bool)
         self._cells[1 : rows + 1, 1 : columns + 1] = False
         self._failed: dict[Window, int] = {}
@@ -91,12 +100,12 @@ class Board:
                 found = find_most_contact(self._cells[first : first + size, left : left + size], bitmaps.runs)
                 if found is not None:
                     return Spot(found.direction, first + found.row - 1, left + found.column - 1)
-                self._failed[window] = int(_SMALLER * bitmaps.count)
+                self._failed[window] = int(_TUNING.smaller * bitmaps.count)
         return None
 
     def _find_coarsely(self, bitmaps: Bitmaps) -> Spot | None:
         """Find a position on a board of larger cells, each of several cells."""
-        step = ceil((max(self.rows, self.columns) + 2) / _COARSE) + 1
+        step = ceil((max(self.rows, self.columns) + 2) / _TUNING.coarse) + 1
         h, w = (ceil(n / step) for n in self._cells.shape)
         padded = np.ones((h * step, w * step), dtype=bool)
         padded[: self._cells.shape[0] - 1, : self._cells.shape[1] - 1] = self._cells[1:, 1:]
@@ -114,3 +123,206 @@ def _enlarge_cells(bitmap: BoolArray, step: int) -> BoolArray:
     padded = np.zeros((h * step, w * step), dtype=bool)
     padded[: bitmap.shape[0], : bitmap.shape[1]] = bitmap
     return np.asarray(padded.reshape(h, step, w, step).any(axis=(1, 3)))
+
+
+def fill_rows(occupied: BoolArray, boxes: IntArray) -> IntArray:
+    """Place boxes into the free cells of a rectangle, in rows from the lowest up.
+
+    Parameters
+    ----------
+    occupied : (rows, columns) bool
+        The cells of the boxes are marked.
+    boxes : (k, 2) int
+        Height and width of each box in cells.
+
+    Returns
+    -------
+    (k, 2) int64
+        Row and column of the lowest left cell of each box; -1 for boxes that do not fit.
+    """
+    found = np.full((len(boxes), 2), -1)
+    order = np.lexsort((-boxes[:, 1], -boxes[:, 0]))
+    heights, widths = boxes[order, 0].tolist(), boxes[order, 1].tolist()
+    row, k = 0, 0
+    while k < len(order):
+        height, begun = heights[k], k
+        if row + height > len(occupied):
+            break
+        change = np.diff(occupied[row : row + height].any(axis=0), prepend=True, append=True)
+        for first, end in np.flatnonzero(change).reshape(-1, 2).tolist():
+            while k < len(order) and first + widths[k] <= end:
+                found[order[k]] = row, first
+                occupied[row : row + heights[k], first : first + widths[k]] = True
+                first += widths[k]
+                k += 1
+        row += height if k > begun else 1
+    return found
+
+
+class Spot(NamedTuple):
+    """Position of a bitmap: number of its direction, and row and column of its lowest left cell."""
+
+    direction: int
+    row: int
+    column: int
+
+
+class Runs(NamedTuple):
+    """Bitmaps as runs of cells in rows.
+
+    Attributes
+    ----------
+    runs : (r, 3) int64
+        Row, first column and end of each run; longest runs first for each bitmap.
+    starts : (k + 1,) int64
+        Where the runs of each bitmap start, and where the last ones end.
+    sizes : (k, 2) int64
+        Height and width of each bitmap.
+    """
+
+    runs: IntArray
+    starts: IntArray
+    sizes: IntArray
+
+
+def list_runs(bitmaps: list[BoolArray]) -> Runs:
+    """Return bitmaps (h, w), at least one, as runs."""
+    runs = []
+    for bitmap in bitmaps:
+        change = np.diff(bitmap.astype(np.int8), axis=1, prepend=0, append=0)
+        row, first = np.nonzero(change > 0)
+        found = np.stack([row, first, np.nonzero(change < 0)[1]], axis=1)
+        runs.append(found[np.argsort(found[:, 1] - found[:, 2], kind="stable")])
+    starts = np.cumsum([0, *(len(each) for each in runs)])
+    return Runs(np.concatenate(runs), starts, np.array([bitmap.shape for bitmap in bitmaps], dtype=np.int64))
+
+
+def find_most_contact(occupied: BoolArray, bitmaps: Runs) -> Spot | None:
+    """Place of the most contact in a rectangle of cells (rows, columns); None if no place is free.
+
+    Contact is the number of cells that would be in occupied cells if the bitmap was shifted by one cell, in all four
+    directions together, relative to height plus width of the bitmap. All shifted bitmaps are in the rectangle. Of equal
+    places, the first bitmap is used, and the lowest and then leftmost place.
+    """
+    spot = np.empty(3, dtype=np.int64)
+    if not find_contact(np.ascontiguousarray(occupied), len(occupied), *bitmaps, spot):
+        return None
+    return Spot(*spot.tolist())
+
+
+@compiled
+def find_contact(
+    occupied: BoolArray, rows: int, runs: IntArray, starts: IntArray, sizes: IntArray, spot: IntArray
+) -> int:
+    """Fill in number, row and column of `find_most_contact`; return 0 if there is no free place, else 1."""
+    import scipy.fft
+
+    # Correlations by FFT count the occupied cells at all places at once.
+    cells = occupied.reshape(rows, -1)
+    spectrum = scipy.fft.rfft2(cells.astype(np.float64))
+    best, found = -1.0, 0
+    for k, (h, w) in enumerate(sizes.tolist()):
+        if h + 2 > cells.shape[0] or w + 2 > cells.shape[1]:
+            continue
+        change = np.zeros((cells.shape[0], cells.shape[1] + 1))
+        row, first, end = runs[starts[k] : starts[k + 1]].T
+        change[row, first] += 1
+        change[row, end] -= 1
+        bitmap = np.cumsum(change, axis=1)[:, :-1]
+        overlap = np.rint(scipy.fft.irfft2(spectrum * scipy.fft.rfft2(bitmap).conj(), s=cells.shape))
+        i, j = np.nonzero(overlap[1 : cells.shape[0] - h, 1 : cells.shape[1] - w] == 0)
+        if i.size == 0:
+            continue
+        i, j = i + 1, j + 1
+        contact = overlap[i + 1, j] + overlap[i - 1, j] + overlap[i, j + 1] + overlap[i, j - 1]
+        most = int(contact.argmax())
+        share = float(contact[most]) / (h + w)
+        if share > best:
+            best, found = share, 1
+            spot[:] = k, i[most], j[most]
+    return found
+
+
+# If the cells of two bitmaps with this radius plus half a distance are disjoint, the shapes are at least this distance
+# apart: the centre of some cell is within half a diagonal of the middle between the closest points.
+HALF_DIAGONAL = sqrt(0.5)
+
+
+def draw(shape: Shape, direction: complex, scale: float, radius: float) -> BoolArray:
+    """Cells whose centres are within a distance of a shape.
+
+    Parameters
+    ----------
+    shape : Shape
+    direction : complex
+        Unit vector that becomes the x-axis.
+    scale : float
+        Cells per unit of length.
+    radius : float
+        Distance in cells, at least `HALF_DIAGONAL`.
+
+    Returns
+    -------
+    (h, w) bool
+        Rows are from the lowest up. The centre of the shape's box is the centre of the bitmap.
+    """
+    turn = scale * direction.conjugate()
+    hull = shape.hull * turn
+    low, high = (complex(f(hull.real), f(hull.imag)) for f in (np.min, np.max))
+    w, h = (max(int(side + 2 * radius), 1) for side in ((high - low).real, (high - low).imag))
+    shift = complex(w, h) / 2 - (low + high) / 2
+    tails, heads = shape.tails * turn + shift, shape.heads * turn + shift
+    found = _fill(tails, heads, h, w)
+    _mark_near(found, tails, heads, radius)
+    return found
+
+
+def draw_in_place(shape: Shape, rows: int, columns: int, radius: float) -> BoolArray:
+    """Cells (rows, columns) of a rectangle at the origin within a distance of a shape; the unit is a cell."""
+    near = radius + 1
+    tails, heads = shape.tails, shape.heads
+    lowest, highest = np.minimum(tails.imag, heads.imag), np.maximum(tails.imag, heads.imag)
+    leftmost, rightmost = np.minimum(tails.real, heads.real), np.maximum(tails.real, heads.real)
+    beside = (highest < -near) | (lowest > rows + near) | (rightmost < -near) | (leftmost > columns + near)
+    found = _fill(tails, heads, rows, columns)
+    _mark_near(found, tails[~beside], heads[~beside], radius)
+    return found
+
+
+def _fill(tails: ComplexArray, heads: ComplexArray, h: int, w: int) -> BoolArray:
+    """Cells around whose centres the edges wind."""
+    up = heads.imag > tails.imag
+    lower, upper = np.where(up, tails, heads), np.where(up, heads, tails)
+    # Rows of centres y with lower ≤ y < upper.
+    first, end = (np.clip(np.ceil(ends.imag - 0.5), 0, h).astype(np.int64) for ends in (lower, upper))
+    edge, step = enumerate_each(end - first)
+    row = first[edge] + step
+    ahead = upper[edge] - lower[edge]
+    x = lower.real[edge] + (row + 0.5 - lower.imag[edge]) * (ahead.real / ahead.imag)
+    column = np.clip(np.ceil(x - 0.5).astype(np.int64), 0, w)
+    change = np.bincount(row * (w + 1) + column, np.where(up[edge], 1.0, -1.0), h * (w + 1))
+    return np.asarray(np.cumsum(change.reshape(h, w + 1), axis=1)[:, :w] != 0)
+
+
+def _mark_near(cells: BoolArray, tails: ComplexArray, heads: ComplexArray, radius: float) -> None:
+    """Mark the cells whose centres are within a distance of an edge."""
+    # Maximum distance between samples of an edge, in cells.
+    spacing = 0.5
+    h, w = cells.shape
+    count = np.maximum(np.ceil(np.abs(heads - tails) / spacing), 1).astype(np.int64)
+    edge, step = enumerate_each(count)
+    samples = tails[edge] + (heads - tails)[edge] * (step / count[edge])
+    # Every point of an edge is at most half the spacing from a sample.
+    reach = radius**2 + spacing**2 / 4
+    i, j = np.floor(samples.imag).astype(np.int64), np.floor(samples.real).astype(np.int64)
+    y, x = samples.imag - i, samples.real - j
+    k = int(sqrt(reach)) + 2
+    inside = (i > -k) & (i < h + k) & (j > -k) & (j < w + k)
+    i, j, y, x = i[inside], j[inside], y[inside], x[inside]
+    padded = np.zeros((h + 4 * k, w + 4 * k), dtype=bool)
+    flat, place = padded.ravel(), (i + 2 * k) * padded.shape[1] + j + 2 * k
+    for di in range(-k + 1, k):
+        vertical: FloatArray = (di + 0.5 - y) ** 2
+        for dj in range(-k + 1, k):
+            flat[place[vertical + (dj + 0.5 - x) ** 2 <= reach] + di * padded.shape[1] + dj] = True
+    cells |= padded[2 * k : 2 * k + h, 2 * k : 2 * k + w]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import ceil, hypot, pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,20 +20,28 @@ from quasiharmonic.apps.atlas.packing.bitmap_search import (
 from quasiharmonic.apps.atlas.packing.shapes import Shape
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-# Share of the tiles that charts with half the padding around them are expected to cover.
-_EXPECTED = 0.8
-# Directions compared for the expected scale.
-_TURNS = 16
+
+class LayoutTuning(NamedTuple):
+    """Numbers that tune the search for the scale of a layout."""
+
+    # Share of the tiles that charts with half the padding around them are expected to cover.
+    expected: float = 0.8
+    # Directions compared for the expected scale.
+    turns: int = 16
+    # Cells around charts that stay are first as large as otherwise, then smaller by this factor.
+    finer: tuple[int, ...] = (1, 4)
+    # Relative precision of the sufficient size.
+    size_precision: float = 0.01
+
+
+_TUNING = LayoutTuning()
+
 # Angles compared for the direction of a single chart, and the precision of the best one.
 _ANGLES, _ANGLE_PRECISION = 256, 1e-6
 #: Largest side of a texture in texels: single precision stores no more positions.
 MAX_SIZE = 1 << 24
-# Cells around charts that stay are first as large as otherwise, then smaller by this factor.
-_FINER = 1, 4
 # Largest number of times that the scale there is halved, and then bisected.
 _HALVINGS, _BISECTIONS = 24, 5
-# Relative precision of the sufficient size.
-_SIZE_PRECISION = 0.01
 
 
 def find_layout(
@@ -134,7 +143,7 @@ def find_layout_around(
     def place(scale: float) -> Layout | None:
         if not _may_fit(shapes, size, tiles, scale):
             return None
-        for finer in _FINER:
+        for finer in _TUNING.finer:
             search = BitmapSearch(shapes, size, padding, tiles, scale, rotate=rotate, occupied=occupied, finer=finer)
             if (found := search.place_in(search.cells)) is not None:
                 return found
@@ -221,7 +230,7 @@ def find_sufficient_size(
         low, high = high, 2 * high
         if high * max(size) > MAX_SIZE:
             return enlarge(high)
-    while enlarge(low) != enlarge(high) and high - low > _SIZE_PRECISION * high:
+    while enlarge(low) != enlarge(high) and high - low > _TUNING.size_precision * high:
         middle = (low + high) / 2
         low, high = (low, middle) if fits(enlarge(middle)) else (middle, high)
     return enlarge(high)
@@ -244,10 +253,10 @@ def _expected_scale(shapes: Sequence[Shape], size: tuple[int, int], padding: flo
     """Scale at which the shapes with half the padding around them cover the expected share of the tiles."""
     area = sum(shape.area for shape in shapes)
     length = sum(float(np.abs(shape.heads - shape.tails).sum()) for shape in shapes)
-    free = _EXPECTED * tiles * size[0] * size[1] - len(shapes) * pi * padding**2 / 4
+    free = _TUNING.expected * tiles * size[0] * size[1] - len(shapes) * pi * padding**2 / 4
     b = length * padding / 2
     # The largest shape must fit in the tile, in its best direction of a few.
-    turns = np.exp(0.5j * pi * np.arange(_TURNS) / _TURNS)
+    turns = np.exp(0.5j * pi * np.arange(_TUNING.turns) / _TUNING.turns)
     sides = [_least_length(shape, turns) for shape in shapes]
     fits = (max(size) - padding) / (max(sides) or 1.0)
     if free <= 0:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence, Sized
 from dataclasses import dataclass
 from math import atan2
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, Layout
-from quasiharmonic.apps.atlas.packing.copies import Copy, Motion, find_copies
 from quasiharmonic.apps.atlas.packing.layout import (
     MAX_SIZE,
     find_layout,
@@ -21,6 +22,7 @@ from quasiharmonic.apps.atlas.packing.layout import (
 )
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.util.arrays import (
+    ComplexArray,
     FloatArray,
     IntArray,
     check_bool,
@@ -31,11 +33,9 @@ from quasiharmonic.util.arrays import (
     describe,
     map_array,
     to_complex,
+    to_points,
     triangle_array,
 )
-
-# Additional space between charts, relative to the texture's side, for rounding to single precision.
-_ROUNDING = 2.0**-22
 
 
 @dataclass(frozen=True)
@@ -170,6 +170,8 @@ def pack_charts(
     >>> len(packing.placements), bool(packing.utilisation > 0.3)
     (2, True)
     """
+    # Additional space between charts, relative to the texture's side, for rounding to single precision.
+    rounding = 2.0**-22
     pairs = _check_charts(charts)
     size = check_texture(resolution, padding, texels_per_unit, tiles, rotate, stack)
     if kinds is not None and len(kinds) != len(pairs):
@@ -188,7 +190,7 @@ def pack_charts(
     shapes = [make_shape(*pairs[i]) for i in originals]
     # Coordinates of later tiles are larger, and so are their rounding errors.
     reach = max(min(tiles, 10), -(-tiles // 10))
-    spaced = padding + max(size) * (_ROUNDING * 2.0 ** (reach - 1).bit_length() + _deviation(pairs, copies))
+    spaced = padding + max(size) * (rounding * 2.0 ** (reach - 1).bit_length() + _deviation(pairs, copies))
     if wanted is not None and wanted < least_scale(shapes):
         raise ValueError(
             f"with {texels_per_unit:g} texels per unit, all charts are smaller than a texel: use more texels per unit"
@@ -293,3 +295,93 @@ def _transform(uv: FloatArray, scale: float, placement: Placement, size: tuple[i
         z = -z.conjugate()
     z = z * (scale * np.exp(1j * placement.angle)) + complex(*placement.offset)
     return np.stack([z.real / size[0] + placement.tile % 10, z.imag / size[1] + placement.tile // 10], axis=1)
+
+
+# Largest distance between vertices of congruent charts, relative to the chart's radius.
+_TOLERANCE = 1e-4
+
+
+class Motion(NamedTuple):
+    """A motion of the plane: change the sign of x if mirrored, multiply by a unit complex number, then shift."""
+
+    mirrored: bool
+    turn: complex
+    shift: complex
+
+    def move(self, z: ComplexArray) -> ComplexArray:
+        """Apply the motion to points (k,)."""
+        return np.asarray((-z.conj() if self.mirrored else z) * self.turn + self.shift)
+
+
+class Copy(NamedTuple):
+    """A chart that a motion moves onto an earlier one, and the largest remaining distance of their vertices."""
+
+    original: int
+    motion: Motion
+    deviation: float
+
+
+def find_copies(charts: list[tuple[FloatArray, IntArray]], kinds: Sequence[int] | None = None) -> dict[int, Copy]:
+    """Find the charts that are congruent to an earlier one of their kind, with vertices and triangles in any order."""
+    originals: defaultdict[tuple[int, int, int], list[_Original]] = defaultdict(list)
+    copies = {}
+    for i, (uv, F) in enumerate(charts):
+        z = to_complex(uv)
+        z = z - z.mean()
+        same_sizes = originals[len(uv), len(F), kinds[i] if kinds is not None else 0]
+        for original in same_sizes:
+            found = _align(z, F, original.z, charts[original.chart][1], original.tree)
+            if found is not None:
+                motion, deviation = found
+                # The motion is relative to the mean of the vertices.
+                here = complex(*uv.mean(axis=0))
+                there = complex(*charts[original.chart][0].mean(axis=0))
+                shift = motion.shift + there - complex(motion._replace(shift=0).move(np.array([here]))[0])
+                copies[i] = Copy(original.chart, motion._replace(shift=shift), deviation)
+                break
+        else:
+            same_sizes.append(_Original(i, z, KDTree(to_points(z))))
+    return copies
+
+
+class _Original(NamedTuple):
+    """A chart with its vertices, relative to their mean."""
+
+    chart: int
+    z: ComplexArray
+    tree: KDTree
+
+
+def _align(
+    z: ComplexArray, F: IntArray, goal: ComplexArray, goal_F: IntArray, tree: KDTree
+) -> tuple[Motion, float] | None:
+    """Motion of vertices with mean zero onto those of another chart, if the charts are congruent."""
+    # Vertices of a chart compared with the most distant vertex of another.
+    most_anchors = 64
+    radius = float(np.abs(goal).max())
+    tolerance = _TOLERANCE * radius
+    if abs(float(np.abs(z).max()) - radius) > tolerance:
+        return None
+    anchor = goal[np.argmax(np.abs(goal))]
+    near = np.flatnonzero(np.abs(np.abs(z) - radius) <= tolerance)[:most_anchors]
+    for mirrored in (False, True):
+        for vertex in near.tolist():
+            start = Motion(mirrored, 1, 0).move(z)
+            turn = complex(anchor * start[vertex].conj())
+            moved = start * (turn / abs(turn)) if turn else start
+            distance, match = tree.query(to_points(moved))
+            if distance.max() > tolerance or len(np.unique(match)) < len(match):
+                continue
+            if not np.array_equal(_sorted_triangles(match[F]), _sorted_triangles(goal_F)):
+                continue
+            # The best rotation for all vertices.
+            best = complex(np.vdot(start, goal[match]))
+            motion = Motion(mirrored, best / abs(best) if best else 1, 0)
+            return motion, float(np.abs(motion.move(z) - goal[match]).max())
+    return None
+
+
+def _sorted_triangles(F: IntArray) -> IntArray:
+    """Triangles in an order that depends neither on their rows nor on their corners."""
+    rows = np.sort(F, axis=1)
+    return np.asarray(rows[np.lexsort(rows.T)])

@@ -11,12 +11,8 @@ from scipy.spatial import ConvexHull, QhullError
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each, to_complex, to_points
 
-# Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
-_AS_SMALL = 1e-9
 # A shape is straight if this share of its outline lies along two perpendicular directions, up to this angle.
 _STRAIGHT, _SKEW = 0.4, np.pi / 180
-# Positions of hull points computed per block.
-_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +126,12 @@ def _find_straight_direction(sides: ComplexArray) -> complex | None:
 
 def find_smallest_box(hull: ComplexArray) -> complex:
     """Unit vector along a side of the box of smallest area around a convex hull (h,), at most 45° from the x-axis."""
+    # Positions of hull points computed per block.
+    block = 1 << 20
     along = _side_directions(hull)
     boxes = [
         np.ptp(seen.real, axis=1) * np.ptp(seen.imag, axis=1)
-        for some in np.array_split(along, 1 + along.size * hull.size // _BLOCK)
+        for some in np.array_split(along, 1 + along.size * hull.size // block)
         for seen in (hull[None, :] * some.conj()[:, None],)
     ]
     return _least_rotated(along, np.concatenate(boxes))
@@ -153,5 +151,7 @@ def _turn_to_axis(along: ComplexArray) -> ComplexArray:
 
 def _least_rotated(along: ComplexArray, size: FloatArray) -> complex:
     """Of the directions with the smallest size the one with the smallest rotation."""
-    small = np.flatnonzero(size <= (1 + _AS_SMALL) * size.min())
+    # Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
+    as_small = 1e-9
+    small = np.flatnonzero(size <= (1 + as_small) * size.min())
     return complex(along[small[np.argmin(np.abs(along[small].imag))]])

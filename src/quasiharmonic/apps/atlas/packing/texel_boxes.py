@@ -16,8 +16,6 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 
 # Smallest side of a chart's box in texels. Boxes begin at multiples of it, so that texels of half the resolution fit.
 _CELL = 2
-# A chart whose box is larger than the chart by at most this share is a rectangle.
-_RECTANGLE = 1e-6
 # The scale is lowered by this factor until all boxes fit, at most so often, and then bisected.
 _LOWER, _TRIALS, _BISECTIONS = 0.8, 60, 7
 
@@ -67,11 +65,13 @@ def pack_texel_boxes(
     ValueError
         If the charts do not fit. The message names a sufficient resolution.
     """
+    # A chart whose box is larger than the chart by at most this share is a rectangle.
+    rectangle = 1e-6
     shapes = [shape for _, shape in charts]
     directions = np.array([shape.direction if rotate else 1.0 for shape in shapes], dtype=np.complex128)
     sides = np.array([shape.extent(complex(along)) for shape, along in zip(shapes, directions, strict=True)])
     area = np.array([shape.area for shape in shapes])
-    boxes = _TexelBoxes(sides, directions, area >= (1 - _RECTANGLE) * sides.prod(axis=1))
+    boxes = _TexelBoxes(sides, directions, area >= (1 - rectangle) * sides.prod(axis=1))
     gap = ceil(padding)
     scale = texels_per_unit or sqrt(size[0] * size[1] / max(float(sides.prod(axis=1).sum()), np.finfo(float).tiny))
     placed = _place(boxes.texels(scale), size, gap, rotate)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report
 from quasiharmonic.ui.cli.arguments import add_options, choice, file, flag, weld
@@ -32,14 +32,21 @@ if TYPE_CHECKING:
     from quasiharmonic.targets import BoundaryLoop
     from quasiharmonic.ui.cli.pipeline import WrittenMap
 
+
+class CornerLimits(NamedTuple):
+    """Limits of the list of corners."""
+
+    # Maximum number of corners per loop.
+    corners: int = 12
+    # Minimum turning angle of a corner in degrees, as for outlines.
+    min_turn: float = 20.0
+    # Maximum number of vertices per loop in the text report.
+    listed: int = 100
+
+
+_LIMITS = CornerLimits()
 # Texels along a side of the texture, and the largest distance between islands that is measured, in texels.
 _RESOLUTION, _FAR = 2048, 8
-# Maximum number of corners per loop.
-_MAX_CORNERS = 12
-# Minimum turning angle of a corner in degrees, as for outlines.
-_MIN_TURN = 20.0
-# Maximum number of vertices per loop in the text report.
-_LISTED = 100
 
 
 def declare_arguments(parser: argparse.ArgumentParser) -> None:
@@ -228,14 +235,14 @@ def _describe_loop(loop: BoundaryLoop, V: NDArray[np.float64]) -> dict[str, Any]
     """Return a loop in plain Python types; its corners sorted by decreasing turning angle."""
     import numpy as np
 
-    positions, turning = loop.corners(min(_MAX_CORNERS, len(loop.vertices)))
+    positions, turning = loop.corners(min(_LIMITS.corners, len(loop.vertices)))
     vertices, own = loop.vertices[positions], loop.turning[positions]
     corners = [
         {"vertex": vertex, "place": V[vertex].tolist(), "turning": angle, "turning_at_vertex": alone}
         for vertex, angle, alone in zip(
             vertices.tolist(), np.degrees(turning).tolist(), np.degrees(own).tolist(), strict=True
         )
-        if abs(angle) >= _MIN_TURN
+        if abs(angle) >= _LIMITS.min_turn
     ]
     return {
         "vertices": loop.vertices.tolist(),
@@ -246,10 +253,10 @@ def _describe_loop(loop: BoundaryLoop, V: NDArray[np.float64]) -> dict[str, Any]
 
 def _sentences(i: int, loop: dict[str, Any]) -> list[str]:
     vertices = loop["vertices"]
-    more = f", … ({len(vertices)} in all; --json lists them)" if len(vertices) > _LISTED else ""
+    more = f", … ({len(vertices)} in all; --json lists them)" if len(vertices) > _LIMITS.listed else ""
     lines = [
         f"loop {i}: {len(vertices)} vertices, length {loop['length']:.6g}, the surface to the left",
-        "  in order: " + ", ".join(map(str, vertices[:_LISTED])) + more,
+        "  in order: " + ", ".join(map(str, vertices[: _LIMITS.listed])) + more,
     ]
     for corner in loop["corners"]:
         x, y, z = corner["place"]
@@ -258,5 +265,5 @@ def _sentences(i: int, loop: dict[str, Any]) -> list[str]:
             f"{corner['turning_at_vertex']:.0f}° at the vertex, by {corner['turning']:.0f}° with its surroundings"
         )
     if not loop["corners"]:
-        lines.append(f"  no corner of {_MIN_TURN:g}° or more")
+        lines.append(f"  no corner of {_LIMITS.min_turn:g}° or more")
     return lines

@@ -12,8 +12,10 @@ import hmac
 import logging
 import re
 import secrets
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 
@@ -22,10 +24,10 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.http11 import Request, Response
 
+from quasiharmonic.ui.batch.supervisor import resident
 from quasiharmonic.ui.studio.assets import assets
 from quasiharmonic.ui.studio.offered import offered_options
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
-from quasiharmonic.ui.studio.server.pages import Page
 from quasiharmonic.util.options import ENERGY_LABELS
 
 HOST = "127.0.0.1"
@@ -39,6 +41,15 @@ ELSEWHERE = 4001
 _SESSION = re.compile(r"[0-9a-f]{32}")
 #: Close code of a socket if too many pages are open.
 TRY_LATER = 1013
+# Code of the worker process; -P prevents imports from the working directory.
+_CODE = "import sys; from quasiharmonic.ui.studio.server.page_worker import serve; serve(*sys.argv[1:])"
+#: Memory limit of one page, bytes.
+MAX_MEMORY = 6 << 30
+# Seconds between two checks, and seconds until a process must react to "stop".
+_CHECK_INTERVAL = 0.5
+_STOP_TIMEOUT = 15.0
+# Bytes written to a process at a time, to avoid a second copy of large messages.
+_WRITE_SIZE = 1 << 18
 # Load nothing from other sites, forbid framing, and never send the address with its token as a referrer.
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
@@ -108,7 +119,7 @@ class Studio:
             try:
                 await server.serve_forever()
             finally:
-                await asyncio.gather(*(page.ended() for page in list(self._pages)))
+                await asyncio.gather(*(page.wait_for_end() for page in list(self._pages)))
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuse a request, answer it with a file, or return None to open a socket."""
@@ -179,7 +190,7 @@ class Studio:
             await connection.close(1011, "the process has ended")
         finally:
             listening.cancel()
-            await page.ended()
+            await page.wait_for_end()
             self._pages.discard(page)
             if self._sessions.get(session, (None, None))[1] is page:
                 del self._sessions[session]
@@ -195,7 +206,7 @@ class Studio:
         if session in self._sessions:
             connection, page = self._sessions.pop(session)
             await connection.close(ELSEWHERE, "this session was opened in another tab")
-            await page.ended()
+            await page.wait_for_end()
 
     async def _listen(self, connection: ServerConnection, page: Page) -> None:
         """Forward the messages of the page to its process."""
@@ -234,3 +245,82 @@ def _answer(status: HTTPStatus, body: str | bytes, kind: str = "text/plain; char
     headers = Headers({**_HEADERS, "Content-Type": kind, "Content-Length": str(len(content)), "Connection": "close"})
     headers.update({name.title(): value for name, value in further.items()})
     return Response(status.value, status.phrase, headers, content)
+
+
+class Page:
+    """Worker process of a page; ``tell`` sends a message of the process to the page."""
+
+    def __init__(self, process: asyncio.subprocess.Process, tell: Callable[[bytes], Awaitable[None]]) -> None:
+        self._process, self._tell = process, tell
+        self._stop_asked: float | None = None
+        self._reason = ""
+
+    @classmethod
+    async def start(cls, source: str, tell: Callable[[bytes], Awaitable[None]], folder: str = "") -> Page:
+        """Start a process for a page that opens ``source``, or a built-in surface if it is empty.
+
+        The process stores its session in ``folder``, and continues the one that is there.
+        """
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-P",
+            "-c",
+            _CODE,
+            source,
+            folder,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            limit=1 << 20,
+        )
+        return cls(process, tell)
+
+    async def send(self, message: bytes, *, stops: bool = False) -> None:
+        """Send a message of the page to the process; after a message that ``stops``, the process must answer soon."""
+        assert self._process.stdin is not None
+        if stops and self._stop_asked is None:
+            self._stop_asked = asyncio.get_running_loop().time()
+        with suppress(ConnectionError, RuntimeError):
+            self._process.stdin.write(len(message).to_bytes(8, "little"))
+            for start in range(0, len(message), _WRITE_SIZE):
+                self._process.stdin.write(message[start : start + _WRITE_SIZE])
+                await self._process.stdin.drain()
+
+    async def run(self) -> str:
+        """Forward messages of the process until it ends; return the reason for its end."""
+        watch = asyncio.ensure_future(self._watch())
+        assert self._process.stdout is not None
+        try:
+            while True:
+                head = await self._process.stdout.readexactly(8)
+                message = await self._process.stdout.readexactly(int.from_bytes(head, "little"))
+                self._stop_asked = None
+                await self._tell(message)
+        except asyncio.IncompleteReadError:
+            code = await self._process.wait()
+            return self._reason or f"the process of this page has ended (exit status {code})"
+        finally:
+            watch.cancel()
+
+    async def _watch(self) -> None:
+        """Kill the process if it uses too much memory or does not react to "stop"."""
+        clock = asyncio.get_running_loop().time
+        while True:
+            await asyncio.sleep(_CHECK_INTERVAL)
+            if (resident(self._process.pid) or 0) > MAX_MEMORY:
+                self._reason = f"this surface used more than {MAX_MEMORY >> 30} GiB of memory"
+            elif self._stop_asked is not None and clock() - self._stop_asked > _STOP_TIMEOUT:
+                self._reason = "the computation could not be stopped"
+            else:
+                continue
+            self.end()
+            return
+
+    def end(self) -> None:
+        """Kill the process."""
+        with suppress(ProcessLookupError):
+            self._process.kill()
+
+    async def wait_for_end(self) -> None:
+        """Kill the process and wait for its end."""
+        self.end()
+        await self._process.wait()

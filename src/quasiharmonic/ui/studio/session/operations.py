@@ -33,10 +33,9 @@ from quasiharmonic.targets.boundary.corner_pins import CornerSpec
 from quasiharmonic.targets.boundary.fitting import find_corner_vertices, fit_boundary, fix_in_place
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.ui.studio.session import recipes
-from quasiharmonic.ui.studio.session.islands import IslandState
 from quasiharmonic.ui.studio.session.outlines import Outline
 from quasiharmonic.ui.studio.session.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Script, Source, public
-from quasiharmonic.ui.studio.session.state import SessionState
+from quasiharmonic.ui.studio.session.state import IslandState, SessionState
 from quasiharmonic.ui.studio.session.validation import RequestError
 from quasiharmonic.util.arrays import IntArray
 

@@ -54,7 +54,7 @@ class Session(PageUpdates):
         bare = open_without_map(sheet)
         self._drag_state, self._after = None, -1
         self._send_surface(bare)
-        self._busy("finding the first map")
+        self._tell_busy("finding the first map")
         try:
             first = make_first_state(sheet, self._step)
         except KeyboardInterrupt:
@@ -131,7 +131,7 @@ class Session(PageUpdates):
         start, end = self._model_vertex(frame, "start"), self._model_vertex(frame, "vertex")
         if start == end:
             return
-        path = self._mirrored(frame, shortest_path(mesh.V, mesh.F, start, end))
+        path = self._add_mirrored(frame, shortest_path(mesh.V, mesh.F, start, end))
         if frame.header.get("forbid") is True:
             self._keep(replace(state, forbidden=add_edges(state.forbidden, path)))
         else:
@@ -143,12 +143,12 @@ class Session(PageUpdates):
         state, V = self.state, self.state.mesh.V
         seams = find_seams(state)
         chain = find_chain(add_edges(seams, state.forbidden), V, self._model_vertex(frame, "vertex"))
-        chain = self._mirrored(frame, chain)
+        chain = self._add_mirrored(frame, chain)
         left = remove_edges(seams, chain, len(V))
         drawn = state.drawn if len(left) == len(seams) else left
         self._keep(replace(state, drawn=drawn, forbidden=remove_edges(state.forbidden, chain, len(V))))
 
-    def _mirrored(self, frame: MessageFrame, edges: IntArray) -> IntArray:
+    def _add_mirrored(self, frame: MessageFrame, edges: IntArray) -> IntArray:
         """Return edges with their mirror images, if the message names the axis of a symmetry."""
         axis = frame.header.get("symmetry")
         surface = self.state.sheet.surface
@@ -167,7 +167,7 @@ class Session(PageUpdates):
     def _do_repair(self, frame: MessageFrame) -> None:
         self._refuse_drawn()
         operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
-        self._busy("repairing")
+        self._tell_busy("repairing")
         self._keep(operations.repair_islands(self.state, self._step))
 
     def _model_vertex(self, frame: MessageFrame, name: str) -> int:
@@ -191,12 +191,12 @@ class Session(PageUpdates):
 
     def _map_to(self, outline: Outline, corners: Any = ()) -> None:
         self._refuse_drawn()
-        self._busy("finding the map")
+        self._tell_busy("finding the map")
         self._keep(operations.map_to_outline(self.state, outline, corners, self._step), fit=True)
 
     def _do_corner(self, frame: MessageFrame) -> None:
         k, vertex = self._find(frame)
-        self._busy("finding the map")
+        self._tell_busy("finding the map")
         self._keep(with_corner(self.state, k, vertex, self._step))
 
     def _do_corners(self, frame: MessageFrame) -> None:
@@ -206,13 +206,13 @@ class Session(PageUpdates):
         self._map_to(outline, "auto")
 
     def _do_flatten(self, frame: MessageFrame) -> None:
-        self._busy("flattening")
+        self._tell_busy("flattening")
         self._keep(operations.flatten_islands(self.state, self._step), fit=True)
 
     def _do_unwrap(self, frame: MessageFrame) -> None:
         options = read_options(frame) | _read_size(frame, 2048)
         which = {name: frame.header.get(name) is True for name in ("keep_seams", "selected")}
-        self._busy("unwrapping")
+        self._tell_busy("unwrapping")
         self._keep(unwrap_model(self.state, self._step, **which, **options), fit=True)
 
     def _do_place(self, frame: MessageFrame) -> None:
@@ -221,7 +221,7 @@ class Session(PageUpdates):
         scale, mirror = float(validation.amount(frame, "scale", 1e-3, 1e3, 1)), frame.header.get("mirror") is True
         texels = _read_size(frame, 2048)["resolution"] if "resolution" in frame.header else None
         # The page has already moved them.
-        self._busy("moving the islands")
+        self._tell_busy("moving the islands")
         self._refuse_drawn()
         self._keep(layout.move_islands(self.state, by, turn, scale, mirror, texels))
 
@@ -229,7 +229,7 @@ class Session(PageUpdates):
         self._refuse_drawn()
         operations.require_injective(replace(self.state, selected=tuple(range(len(self.state.islands)))))
         size = _read_size(frame, 1024)
-        self._busy("packing")
+        self._tell_busy("packing")
         self._keep(layout.pack_all(self.state, **size), fit=True)
 
     def _do_polish(self, frame: MessageFrame) -> None:
@@ -238,7 +238,7 @@ class Session(PageUpdates):
             raise RequestError(f"unknown energy {energy[:40]!r}: use {', '.join(ENERGIES)}")
         self._refuse_drawn()
         operations.require_injective(self.state)
-        self._busy("lowering the distortion")
+        self._tell_busy("lowering the distortion")
         self._keep(operations.polish_islands(self.state, energy, slide, self._step))
 
     def _refuse_drawn(self) -> None:
@@ -303,7 +303,7 @@ class Session(PageUpdates):
         drag, self._drag_state = self._drag_state, None
         if drag is None or drag.goal is None:
             return
-        self._busy("finding the map")
+        self._tell_busy("finding the map")
         reached = drag.shown is not None and drag.shown.reached
         uv = drag.shown.uv if drag.shown is not None and reached else None
         state, start = with_start(self.state, drag.island, drag.goal, uv)

@@ -11,7 +11,6 @@ import numpy as np
 
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.targets import nearest_on_boundary
-from quasiharmonic.ui.studio.session.islands import IslandState
 from quasiharmonic.ui.studio.session.operations import (
     as_it_is,
     fix_where_it_is,
@@ -23,7 +22,7 @@ from quasiharmonic.ui.studio.session.operations import (
 )
 from quasiharmonic.ui.studio.session.outlines import make_outline
 from quasiharmonic.ui.studio.session.recipes import Recipe
-from quasiharmonic.ui.studio.session.state import SessionState
+from quasiharmonic.ui.studio.session.state import IslandState, SessionState
 from quasiharmonic.ui.studio.session.surface import PageSurface
 from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.session.validation import RequestError

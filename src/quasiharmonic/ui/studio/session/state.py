@@ -1,31 +1,40 @@
-"""State of a page: a model, its seams, the map, and how it was computed. Undo and redo switch between states."""
+"""State of a page: a model, its seams, the map, its islands, and how it was computed; undo and redo switch states."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from quasiharmonic.apps.atlas.atlas_verdict import MIRROR
 from quasiharmonic.apps.atlas.atlas_verdict import certify as certify_islands
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.exact.certificate import Certificate
-from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.studio.protocol import Array
-from quasiharmonic.ui.studio.session.islands import IslandState, Numbering
+from quasiharmonic.ui.studio.session.outlines import Outline
 from quasiharmonic.ui.studio.session.recipes import Recipe
 from quasiharmonic.ui.studio.session.surface import PageSurface
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-#: Maximum numbers of obstructions and of elements per obstruction that are sent to the page.
-_MAX_OBSTRUCTIONS = 20
-_MAX_ELEMENTS = 2000
-# Islands above this number are not checked for overlaps with each other after each change.
-_MAX_CHECKED = 2000
+
+class StateLimits(NamedTuple):
+    """Limits of the state that is sent to the page."""
+
+    # Maximum numbers of obstructions and of elements per obstruction.
+    obstructions: int = 20
+    elements: int = 2000
+    # Islands above this number are not checked for overlaps with each other after each change.
+    checked: int = 2000
+
+
+_LIMITS = StateLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +78,7 @@ class SessionState:
     @cached_property
     def overlapping(self) -> IntArray:
         """Pairs (p, 2) of islands that share points of the plane."""
-        if not self.mapped or len(self.islands) == 1 or len(self.islands) > _MAX_CHECKED:
+        if not self.mapped or len(self.islands) == 1 or len(self.islands) > _LIMITS.checked:
             return np.empty((0, 2), dtype=np.int64)
         return certify_islands(self.mesh).overlapping
 
@@ -212,14 +221,14 @@ def describe_obstructions(state: SessionState) -> list[dict[str, Any]]:
                     "message": each.message,
                     "advice": each.advice,
                     "forbids": each.forbids.value,
-                    "vertices": (each.vertices + start).tolist()[:_MAX_ELEMENTS],
-                    "edges": (edges.reshape(-1, 2) + start).tolist()[:_MAX_ELEMENTS],
-                    "triangles": (each.triangles + first).tolist()[:_MAX_ELEMENTS],
+                    "vertices": (each.vertices + start).tolist()[: _LIMITS.elements],
+                    "edges": (edges.reshape(-1, 2) + start).tolist()[: _LIMITS.elements],
+                    "triangles": (each.triangles + first).tolist()[: _LIMITS.elements],
                 }
             )
     if found and state.recipe.dragged:
         return [_describe_drag(found)]
-    return found[:_MAX_OBSTRUCTIONS]
+    return found[: _LIMITS.obstructions]
 
 
 def _describe_drag(found: list[dict[str, Any]]) -> dict[str, Any]:
@@ -234,3 +243,95 @@ def _describe_drag(found: list[dict[str, Any]]) -> dict[str, Any]:
 def _around(loops: list[Array]) -> list[list[int]]:
     """Return the edges of loops."""
     return [edge for loop in loops for edge in np.stack([loop, np.roll(loop, -1)], axis=1).tolist()]
+
+
+@dataclass(eq=False)
+class IslandState:
+    """One island; it is not changed, except for what it computes once.
+
+    Its result and its problem belong to the reflection of the island if it is mirrored.
+    """
+
+    island: Island
+    mirrored: bool = False
+    result: MapResult | None = None  # Its map; None before there is one
+    fixed: IntArray | None = None  # (k,): the fixed vertices of the problem; None before there is one
+    target: FloatArray | None = None  # (k, 2): their target positions
+    pins: tuple[int, ...] = ()  # Fixed interior vertices, in the order in which they were pinned
+    outline: Outline | None = None  # The outline of the boundary; None if it was moved since, or is free
+    corners: tuple[int, ...] = ()  # Boundary vertices at which sides end, in the order of the outline's corners
+    # Vertices that the user assigned to a corner, and the numbers of the corners
+    chosen: tuple[tuple[int, int], ...] = ()
+    by_angle: bool = False  # Whether the corners were found by angle
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The mapping problem; AssertionError before there is one."""
+        assert self.fixed is not None
+        assert self.target is not None
+        return Problem(self.island.V, self.island.F, self.fixed, self.target)
+
+    @cached_property
+    def loops(self) -> list[IntArray]:
+        """Boundary loops; empty if the boundary is not simple."""
+        try:
+            return boundary_loops(self.island.F, len(self.island.V))
+        except ValueError:
+            return []
+
+    @property
+    def sign(self) -> FloatArray:
+        """Factor (2,) from the positions of the result to those on the page, and back."""
+        return MIRROR if self.mirrored else np.ones(2)
+
+    @property
+    def injective(self) -> bool:
+        """Whether there is a map without inverted triangles."""
+        return self.result is not None and self.result.injective
+
+    @property
+    def in_place(self) -> bool:
+        """Whether the fixed vertices of the map are at their target positions."""
+        if self.result is None or self.fixed is None or self.target is None:
+            return True
+        return np.array_equal(self.result.uv[self.fixed], self.target)
+
+    def with_problem(self, problem: Problem) -> IslandState:
+        """Return the island with another problem, whose analyses are kept."""
+        other = replace(self, fixed=problem.fixed, target=problem.target)
+        # Stored, so that they are not computed again.
+        other.problem, other.loops = problem, self.loops
+        return other
+
+    def with_target(self, target: FloatArray) -> IslandState:
+        """Return the island with other target positions, as after a drag; it then has no outline."""
+        return replace(self.with_problem(self.problem.with_target(target)), outline=None, chosen=(), by_angle=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the contents for a snapshot; what can be computed again is left out."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
+
+
+class Numbering:
+    """Numbers of vertices and triangles on the page: those of one island after another."""
+
+    def __init__(self, mesh: SeamedMesh, islands: tuple[IslandState, ...]) -> None:
+        self.starts = np.cumsum([0, *(len(one.island.vertices) for one in islands)])
+        self.first_triangles = np.cumsum([0, *(len(one.island.F) for one in islands)])
+        self.origin = np.concatenate([one.island.vertices for one in islands])
+        self.F = np.concatenate([one.island.F + start for one, start in zip(islands, self.starts, strict=False)])
+        self.V = mesh.V[self.origin]
+
+    def find(self, vertex: int) -> tuple[int, int]:
+        """Return island and own number of a vertex of the page."""
+        k = int(np.searchsorted(self.starts, vertex, side="right")) - 1
+        return k, vertex - int(self.starts[k])
+
+    def equals(self, other: Numbering | None) -> bool:
+        """Return whether another numbering has the same vertices and triangles."""
+        return (
+            other is not None
+            and np.array_equal(self.starts, other.starts)
+            and np.array_equal(self.F, other.F)
+            and np.array_equal(self.origin, other.origin)
+        )

@@ -1,4 +1,4 @@
-/* Kernel of `apps/atlas/packing/contact.py`. */
+/* Kernel of `apps/atlas/packing/board.py`. */
 #include "arguments.h"
 
 #include <stdlib.h>

@@ -1,4 +1,4 @@
-/* Kernels of `solver/field/passes.py`: stiffness of a tensor field, and V3 with its gradient in xi. */
+/* Kernels of `solver/field/objective.py`: stiffness of a tensor field, and V3 with its gradient in xi. */
 #include "arguments.h"
 
 #include <float.h>

@@ -1,4 +1,4 @@
-/* Kernels of `energies/mixtures.py`: sums of the library's isotropic energies, in a = |p|^2 and b = |q|^2. */
+/* Kernels of `energies/deformation.py`: sums of the library's isotropic energies, in a = |p|^2 and b = |q|^2. */
 #include "arguments.h"
 
 #include <math.h>

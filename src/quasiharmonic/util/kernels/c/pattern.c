@@ -1,4 +1,4 @@
-/* Kernels of `linsolve/pattern.py`, and the check of patterns of `linsolve/base.py`. */
+/* Kernels of `linsolve/laplacian.py`, and the check of patterns of `linsolve/base.py`. */
 #include "arguments.h"
 #include "sorting.h"
 
