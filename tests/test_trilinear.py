@@ -75,7 +75,7 @@ def test_tetrahedra_may_be_positive_where_the_trilinear_map_folds():
     assert trilinear.any()
     with pytest.raises(ValueError, match="interpolation must be one of"):
         fold_free(found[0], interpolation="cubic")
-    with pytest.raises(ValueError, match="that of volumes"):
+    with pytest.raises(ValueError, match="only to volumes"):
         fold_free(np.zeros((4, 4, 2)), interpolation="trilinear")
 
 
