@@ -185,7 +185,7 @@ def table(found: list[dict[str, object]], scenes: dict[str, Scene]) -> str:
         about = (SCENES[name].__doc__ or "").split("\n")[0]
         about += f" {len(scene.F):,} triangles, {scene.steps} steps; ends with {scene.end}."
         if name in TURNING:
-            about += f" Its edges allow no turn beyond {forbidden_beyond(scene):,.0f}°."
+            about += f" No motion of this mesh can turn the body further than {forbidden_beyond(scene):,.0f}°."
         lines.append(f"- **{name.capitalize()}.** {about}")
     heads = [f"{name}, {scene.unit}" for name, scene in scenes.items()]
     lines += ["", f"| method | each step from | {' | '.join(heads)} | elasticity solves |"]

@@ -330,7 +330,7 @@ def placed(tree, **node):
         (lambda tree: tree["accessors"][0].update(count=10**15), "too short for its numbers"),
         (lambda tree: tree["accessors"][0].update(count=-1), "whole number"),
         (lambda tree: (tree["accessors"][0].update(count=10**15), tree["accessors"][0].pop("bufferView")), "no data"),
-        (lambda tree: tree["accessors"][-1].update(count=4), "are not a valid number for triangles"),
+        (lambda tree: tree["accessors"][-1].update(count=4), "has 4 indices, not a multiple of 3"),
         (lambda tree: tree["bufferViews"][0].update(byteLength=10**9), "after the end of its buffer"),
         (lambda tree: tree["buffers"][0].update(byteLength=10**9), "shorter"),
         (lambda tree: tree["buffers"][0].update(uri="../../etc/passwd"), "not in the folder"),

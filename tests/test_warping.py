@@ -260,7 +260,7 @@ def test_the_plate_energy_has_the_stated_gradient():
     [
         ({"weights": [1, 1]}, r"weights must have shape \(1,\)"),
         ({"weights": [0]}, "the weight is not positive at landmark 0"),
-        ({"weights": [1], "smoothness": 0}, "weights need a positive smoothness"),
+        ({"weights": [1], "smoothness": 0}, "weights have no effect without smoothness"),
         ({"smoothness": -1}, "smoothness must be a finite number"),
         ({"resolution": 1}, "resolution must be an integer of at least 2"),
         ({"curves": [([[1, 1], [2, 2]],)]}, "curve 0 must be two polylines, before and after, not 1"),

@@ -113,7 +113,7 @@ def own_texture(mesh: MeshData) -> Texture | None:
 
 
 def texture_names(mesh: MeshData) -> list[str]:
-    """Return the names of the images that materials of a mesh's file show by its map, in order, each once.
+    """Return the names of the images that the materials of a mesh's file use, in order and without repetition.
 
     No image is opened.
     """

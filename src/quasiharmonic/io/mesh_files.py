@@ -99,10 +99,10 @@ def check_output(path: str | os.PathLike[str]) -> None:
 
 
 def read_written(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
-    """Read a file that `write_mapped` wrote of ``mesh``.
+    """Read the file that `write_mapped` has written for ``mesh``.
 
-    As `read_mesh`, except for a FreeSurfer patch without a surface beside it, which has the mesh's triangles. The
-    map is in the channel of the mesh's map.
+    The result is that of `read_mesh`, with the map of the channel that ``mesh`` has as its map. A FreeSurfer patch
+    without a surface beside it gets the triangles of ``mesh``.
     """
     read = find_format(path, "read").read_written
     found = read_mesh(path) if read is None else read(path, mesh)
@@ -138,10 +138,14 @@ def select_channel(mesh: MeshData, channel: int) -> MeshData:
 
 
 def place_map(mapped: MeshData, mesh: MeshData, channel: int) -> MeshData:
-    """Return a mesh with a map that is to be written into a channel, and the channels below from a mesh of a file.
+    """Return ``mapped`` with its map in a channel of texture coordinates; the channels below are those of ``mesh``.
 
-    ``mapped`` has the triangles of ``mesh``. Triangles without coordinates in a channel below get those of the map.
-    MeshFileError if the map does not cover them either, or the file does not have a channel below.
+    Both meshes have the same triangles. Triangles without coordinates in a channel below get those of the map.
+
+    Raises
+    ------
+    MeshFileError
+        If such a triangle has no coordinates in the map either, or ``mesh`` lacks a channel below.
     """
     below = tuple(_find_channel(mesh, k).corner_uv.copy() for k in range(channel))
     for k, corners in enumerate(below):

@@ -46,7 +46,7 @@ def _backend(name: str) -> type[LinearSolver]:
 
 
 def available(entries: int | None = None) -> tuple[str, ...]:
-    """Names of the installed backends, best first; does not load them.
+    """Return the names of the installed backends, best first, without loading them.
 
     The order is for upper triangles with this number of entries, by default for large ones.
     """
@@ -63,7 +63,7 @@ def check_name(name: object) -> None:
 
 
 def takes_order(name: str = "auto") -> bool:
-    """Whether `make_solver` with this name and a large system uses a given elimination order."""
+    """Return whether the solver of this name accepts an elimination order for large systems (`make_solver`)."""
     check_name(name)
     chosen = available()[0] if name == "auto" else name
     return _backend(chosen).takes_order

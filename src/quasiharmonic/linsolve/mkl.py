@@ -257,7 +257,10 @@ def load_mkl() -> ctypes.CDLL:
         raise ImportError(f"cannot load MKL's runtime library {path}: {error}") from error
     # The environment or another package may have switched MKL to 64-bit integers for the whole process.
     if layer & 1:
-        raise ImportError("MKL is set to 64-bit integers (ILP64) in this process; PARDISO is called with 32-bit ones")
+        raise ImportError(
+            "MKL uses 64-bit integers (ILP64) in this process, but this package needs 32-bit integers: set "
+            "MKL_INTERFACE_LAYER=LP64, or choose another linear solver"
+        )
     # By default MKL uses GNU threads if another package, such as gmsh, has loaded them, and PARDISO then crashes.
     library.MKL_Set_Threading_Layer(_OPTIONS.intel_threads)
     library.pardiso.restype = None

@@ -87,7 +87,7 @@ def certify(
 def is_injective(F: ArrayLike, uv: ArrayLike) -> bool:
     """Return whether the map has triangles and all are strictly positive, decided exactly.
 
-    `inverted_triangles` returns which triangles are not.
+    `inverted_triangles` returns the triangles that are not.
 
     Parameters
     ----------

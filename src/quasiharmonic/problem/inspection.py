@@ -196,7 +196,7 @@ def boundary_loops(F: ArrayLike | MeshLike, n: int | None = None) -> list[IntArr
 
 @accepts_mesh
 def inspect_mesh(V: ArrayLike, F: ArrayLike, *, weld: bool | float = False) -> MeshReport:
-    """Return topology and defects of any triangles; nothing is rejected but malformed arrays.
+    """Return the topology and the defects of any triangles; only malformed arrays raise an error.
 
     Parameters
     ----------

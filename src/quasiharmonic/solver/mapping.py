@@ -236,8 +236,8 @@ def quasi_harmonic_map(
     mu : (f,) complex128, optional
         Beltrami coefficients of the tensors, with modulus below 1. Default: zero.
     reference : {"equilateral", "rest", "corrected"}
-            Reference triangles in whose frames the coefficients are expressed. A reference set in ``problem`` takes
-            precedence.
+        Reference triangles in whose frames the coefficients are expressed. A reference set in ``problem`` takes
+        precedence.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
 

@@ -206,7 +206,7 @@ def injective_map(
     mesh = as_seamed_mesh(mesh)
     checked = _check_fixed(mesh, fixed)
     if to is None and corners is not None:
-        raise ValueError("corners are those of an outline: give it by to")
+        raise ValueError("corners need an outline: give one by to")
     if to is not None and checked is not None:
         raise ValueError("an outline fixes the boundary: omit fixed or to")
     contours, copies = [] if to is None else outline(to), count()

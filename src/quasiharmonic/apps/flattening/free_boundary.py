@@ -148,7 +148,7 @@ def flatten(V: ArrayLike, F: ArrayLike, **options: Unpack[FlattenKeywords]) -> M
         - ``STILL_FALLING``: stopped after ``max_iterations``.
         - ``EXHAUSTED``: doubles cannot represent a better map.
         - ``COLLAPSED``: from every initial map, the result is stretched far more than the surface requires.
-        - ``INTERRUPTED``: stopped by Ctrl-C; the map is the best so far.
+        - ``INTERRUPTED``, ``TIME_LIMIT``: stopped by Ctrl-C or ``time_limit``; the map is the best so far.
         - With fixed vertices also ``IMPOSSIBLE``, with the cause in ``diagnosis``, or the status of the search. The
           map is then the best found and may not be injective; see its certificate. The same holds after an interrupt
           of that search.

@@ -152,7 +152,7 @@ def warp_by_landmarks(
     check_non_negative("smoothness", length)
     given = make_landmarks(landmarks, target, weights, curves, float(size.max()) / resolution, size)
     if not length and not given.hard.all():
-        raise ValueError("weights need a positive smoothness: without it, a point moves nothing else")
+        raise ValueError("weights have no effect without smoothness: give a positive smoothness, or omit weights")
     before, after, edge = given.before, given.after, is_on_border(given.before, size)
     points, F = make_image_mesh(before, width, height, resolution)
     own = len(points) - len(before) + np.arange(len(before))

@@ -108,7 +108,7 @@ class Curve:
     def __init__(self, pieces: Sequence[ArrayLike | Arc]) -> None:
         found = [part for i, piece in enumerate(pieces) for part in split_piece(i, piece)]
         if not found:
-            raise ValueError("a curve has at least one piece")
+            raise ValueError("a curve must have at least one piece")
         self._degree = np.array([part.degree for part in found])
         self._control = np.stack([part.control for part in found])
         self._angles = np.array([part.angles for part in found])

@@ -61,7 +61,7 @@ class RefinedProblem(BaseOutcome):
 
 @accepts_mesh
 def refine(V: ArrayLike, F: ArrayLike, edges: ArrayLike, *, boundary: bool = False) -> Refined:
-    """Split edges of a mesh at their midpoints, and the triangles beside them to match.
+    """Split edges of a mesh at their midpoints, and divide the triangles beside these edges.
 
     A triangle with one split edge becomes two, with two split edges three (along the shorter diagonal of the remaining
     quadrilateral), with three split edges four. Other triangles do not change. Original vertices keep their positions

@@ -236,7 +236,7 @@ def chords_of(loop: IntArray, interior: IntArray, n: int) -> IntArray:
 
 
 def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolerance: float = STRAIGHT) -> IntArray:
-    """Interior edges that the target places along its own boundary, so that the part they cut off has no area.
+    """Return interior edges that the target places along its boundary, so that the part they cut off has no area.
 
     Between the ends of such an edge, the target boundary does not bend outwards. It is straight, like a side of a
     polygon, or goes around a notch. A common case is a triangle with two boundary edges on one side of a rectangle.

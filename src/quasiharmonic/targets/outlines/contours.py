@@ -27,7 +27,7 @@ MAX_POINTS = 1_000_000
 
 
 def signed_area(contour: ArrayLike) -> float:
-    """Area inside a contour, positive if it is counterclockwise.
+    """Return the area inside a contour, positive if it is counterclockwise.
 
     Parameters
     ----------

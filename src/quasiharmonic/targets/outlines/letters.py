@@ -51,7 +51,7 @@ _TANGENT_LETTERS = (
 
 
 def letter(character: str, font: Font | None = None, *, tolerance: float = 5e-4) -> list[FloatArray]:
-    """Outline of one character of a font.
+    """Return the outline of one character of a font.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def _find_installed(name: str) -> FilePath:
 
 
 def word(text: str, font: Font | None = None, *, overlap: float = OVERLAP, tolerance: float = 5e-4) -> list[FloatArray]:
-    """Outline of several letters that overlap and form one piece.
+    """Return the outline of several letters that overlap and form one piece.
 
     A connected surface cannot fill an outline of several pieces, so the letters must overlap.
 

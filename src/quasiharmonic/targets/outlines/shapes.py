@@ -14,7 +14,7 @@ from quasiharmonic.util.arrays import FloatArray, check_integer, check_numbers, 
 
 
 def disk(radius: float = 1.0, points: int = 256) -> FloatArray:
-    """Outline of a disk around the origin: an `ellipse` with equal axes.
+    """Return the outline of a disk around the origin: an `ellipse` with equal axes.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def disk(radius: float = 1.0, points: int = 256) -> FloatArray:
 
 
 def ellipse(a: float, b: float, points: int = 256) -> FloatArray:
-    """Outline of an ellipse around the origin.
+    """Return the outline of an ellipse around the origin.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def ellipse(a: float, b: float, points: int = 256) -> FloatArray:
 
 
 def rectangle(width: float, height: float) -> FloatArray:
-    """Outline of the rectangle from the origin to ``(width, height)``.
+    """Return the outline of the rectangle from the origin to ``(width, height)``.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def rectangle(width: float, height: float) -> FloatArray:
 
 
 def regular_polygon(corners: int, radius: float = 1.0) -> FloatArray:
-    """Outline of a regular polygon around the origin.
+    """Return the outline of a regular polygon around the origin.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def regular_polygon(corners: int, radius: float = 1.0) -> FloatArray:
 
 
 def star(tips: int, inner: float = 0.5) -> FloatArray:
-    """Outline of a star around the origin, with its tips on the unit circle.
+    """Return the outline of a star around the origin, with its tips on the unit circle.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def star(tips: int, inner: float = 0.5) -> FloatArray:
 
 
 def ring(inner: float = 0.5, points: int = 256) -> list[FloatArray]:
-    """Outline of the unit disk around the origin with a concentric circular hole.
+    """Return the outline of the unit disk around the origin with a concentric circular hole.
 
     Parameters
     ----------

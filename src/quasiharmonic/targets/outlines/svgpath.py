@@ -90,21 +90,21 @@ class _Scanner:
             self._skip()
             return character
         if previous in ("", "z", "Z") or not _NUMBER.match(self.text, self.at):
-            raise self.error("a command is needed")
+            raise self.error("a command, which is a letter, is missing")
         # Further pairs of numbers after a move are lines.
         return {"M": "L", "m": "l"}.get(previous, previous)
 
     def number(self) -> float:
         found = _NUMBER.match(self.text, self.at)
         if found is None:
-            raise self.error("a number is needed")
+            raise self.error("a number is missing")
         self.at = found.end()
         self._skip(comma=True)
         return float(found.group())
 
     def flag(self) -> float:
         if self.text[self.at : self.at + 1] not in ("0", "1"):
-            raise self.error("a flag, 0 or 1, is needed")
+            raise self.error("a flag, 0 or 1, is missing")
         self.at += 1
         value = float(self.text[self.at - 1])
         self._skip(comma=True)

@@ -230,7 +230,7 @@ def _triangles(corners: IntArray, mode: int) -> IntArray:
     """Return the triangles (k, 3) of a list, a strip or a fan."""
     if mode == _TRIANGLES:
         if len(corners) % 3:
-            raise ValueError(f"{len(corners)} indices are not a valid number for triangles")
+            raise ValueError(f"a list of triangles has {len(corners)} indices, not a multiple of 3")
         return corners.reshape(-1, 3)
     i = np.arange(max(len(corners) - 2, 0))
     if mode == _FAN:

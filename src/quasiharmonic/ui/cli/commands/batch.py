@@ -73,8 +73,8 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
     add_options(
         parser,
         report=flag(
-            "write OUT/report.html about the run: success, distortion, times, the slowest, worst and failed problems "
-            "with images; without DIR_OR_LIST, about the run or the table of records (.csv, .parquet) that -o names"
+            "write OUT/report.html: success, distortion and times of the run, with images of the slowest, worst and "
+            "failed problems; without DIR_OR_LIST, the run is the folder or the table (.csv, .parquet) that -o names"
         ),
         against=file(
             "for --report: compare with another run, or with a table about another program, with the columns problem "

@@ -69,8 +69,8 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
             ("vertex", "triangle"), "for --values: whether rows belong to vertices or to triangles (default: vertex)"
         ),
         landmarks=file(
-            "transfer vertices of the source, 0-based, one per line; writes .csv: vertex, triangle of the target, "
-            "three weights of its corners, its nearest corner, position",
+            "file of vertices of the source to transfer, 0-based, one per line, and a .csv file to write: vertex, "
+            "triangle of the target, weights of its three corners, nearest corner, position",
             **pair,
         ),
         outside=choice(

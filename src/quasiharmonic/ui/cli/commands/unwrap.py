@@ -83,7 +83,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         ),
         hard_edges=number(
             _hard_edges,
-            "make all edges seams that have a larger angle between the normals, in degrees; file: the edges with "
+            "make seams of all edges with a larger angle between the normals, in degrees; file: of the edges with "
             "split normals or between smoothing groups",
             metavar="ANGLE",
         ),
