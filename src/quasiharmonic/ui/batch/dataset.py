@@ -1,7 +1,8 @@
 """A data set during a run: its readers hand over problems, and its writers keep their results.
 
 A problem is *known* once its reader has named it, *pending* from when it is handed over until its results are kept, and
-*ready* when it is finished but not yet reported. A stream is *open* from its first problem until all its problems are kept.
+*ready* when it is finished but not yet reported. A stream is *open* from its first problem until the results of all its
+problems are kept.
 """
 
 from __future__ import annotations
@@ -55,11 +56,9 @@ class DataSet:
         self.orders = orders
         self._streams, self._scratch, self._count = streams, scratch, count
         self._lock = threading.RLock()  # `problems` runs in other threads than the other methods
-        self._pending: dict[
-            str, tuple[Stream, ProblemFiles]
-        ] = {}  # By name: problems that are handed over and not kept
+        self._pending: dict[str, tuple[Stream, ProblemFiles]] = {}  # Pending problems by name
         self._open: list[Stream] = []  # Streams whose writers are not complete
-        self._ready: list[Finished] = []  # Finished problems that `collect` has not returned yet
+        self._ready: list[Finished] = []  # Reports that `collect` has not returned yet
         self._known = 0  # Number of problems so far
         self._read_streams = 0  # Number of streams that are read to their end
         self._known_in_read = 0  # Number of problems of these streams
