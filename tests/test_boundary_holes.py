@@ -11,7 +11,7 @@ from quasiharmonic import Problem, cut_open, injective_map, refine, surfaces, ta
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.targets import boundary_to, flattened_edges, outline
 from quasiharmonic.targets.boundary.boundary_to import choose_least_stretch
-from quasiharmonic.targets.boundary.correspondence import arc_parameters, places_along, points_at
+from quasiharmonic.targets.boundary.correspondence import arc_parameters, find_parameters, points_at
 from shared.boundaries import holed, placed, torus
 
 
@@ -79,7 +79,8 @@ def test_holes_are_rotated_for_the_least_energy():
         s = arc_parameters(V[problem.domain.loops[i]])
         starts = range(0, len(s), max(1, len(s) // 8))
         choices[i] = [
-            points_at(square + np.array([x, 0.1]), places_along(s, square, [(k, 0.0)], corner_angle=20)) for k in starts
+            points_at(square + np.array([x, 0.1]), find_parameters(s, square, [(k, 0.0)], corner_angle=20))
+            for k in starts
         ]
 
     def energy(places):

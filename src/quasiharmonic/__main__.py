@@ -1,17 +1,17 @@
-"""The command ``qhm``, which is ``python -m quasiharmonic``, as a process.
+"""The command ``qhm``, also ``python -m quasiharmonic``, as a process.
 
-Nothing is imported before it is seen to that Ctrl-C ends the process in a sentence.
+All imports are inside `main`, so that Ctrl-C during an import ends the process with a message instead of a traceback.
 """
 
 
 def main() -> int:
-    """Run the command with the arguments of the process, which then ends; its exit status."""
+    """Run the command with the arguments of the process; return the exit status, with which the process must end."""
     try:
         from quasiharmonic.ui.cli import main as run
 
         status = run()
     except SystemExit as end:
-        # A page of help, the version, or a wrong call.
+        # argparse exits after a page of help, after the version, and after a wrong call.
         status = end.code if isinstance(end.code, int) else 0
     except KeyboardInterrupt:
         import sys
@@ -21,10 +21,11 @@ def main() -> int:
     finally:
         import signal
 
-        # What has been said stays true: all that is left to do is to end.
+        # The command has reported its result, and an interrupt must not change the exit status any more.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        # An interrupt that came out of an `exec`, as of a dataclass while it is loaded, counts as unhandled, and would
-        # end the process by a signal in place of its status, until another one runs through.
+        # If an interrupt leaves an `exec`, Python marks it as unhandled, even if it is caught later, and then ends the
+        # process by SIGINT in place of the status. Such an `exec` runs when the module of a dataclass is imported.
+        # The next `exec` removes the mark.
         exec("")
     from quasiharmonic.ui.cli.process import finish
 

@@ -1,7 +1,4 @@
-"""Packages that only some functions need.
-
-One of them is pandas, for tables of results as DataFrames.
-"""
+"""Optional packages: import errors that say what to install, and pandas for results as DataFrames."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def explain_missing(need: str, package: str = "", *, extra: str = "", hint: str = "") -> Iterator[None]:
-    """Say in an ImportError of the block what needs the package, and what to install.
+    """Add to an ImportError of the block what needs the package, and the command that installs it.
 
     ``need`` is a clause such as "NIfTI files need nibabel". ``package`` is what follows ``pip install``, unless an
     ``extra`` of this package is named. ``hint`` is added to the command.

@@ -347,7 +347,7 @@ def _select_curves(
     """Return the boundary curves in the indices of the triangles' vertices, with moved vertices fixed."""
     own_fixed = np.searchsorted(used, moved)
     if isinstance(slide, BoundaryCurves):
-        return slide.restrict(used).fix_if_not_sliding(own_fixed)
+        return slide.restrict(used).with_fixed_unless_on(own_fixed)
     if slide is not True:
         return slide
     positions = np.zeros((problem.n, 2))

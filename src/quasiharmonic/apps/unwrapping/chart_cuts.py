@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
@@ -13,33 +15,45 @@ from quasiharmonic.geometry.mesh.topology import label_components, pair_sides
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
-# An extension reaches at most this number of peaks; fewer if less than this share of the area is over the bound.
-_MAX_PEAKS = 24
-_MANY_OVER = 0.2
-# Other peaks closer than this multiple of the depth of a peak are not reached by the same extension.
-_NEAR = 0.3
-# The cost of an edge for a dividing line decreases with the excess of the stretch by this factor.
-_ATTRACTION = 10.0
-# Number of averages of the stretch over neighbouring triangles, and the largest stretch in these averages.
-_SMOOTHINGS = 3
-_MAX_PEAK = 4.0
-# A dividing line stays between these values of the relative distance from its two ends.
-_BAND = (0.25, 0.75)
-# Around each end, up to this distance, triangles belong to the nearer end; the chart has area 1.
-_REACH = 0.15
-# The band of a large chart is narrowed until it has at most this number of triangles.
-_MAX_BAND = 6_000
-# Number of boundary positions between which a dividing line is sought, and what a balanced line is worth.
-_SAMPLES = 256
-_BALANCE = 0.2
-# A part with a smaller share of the triangles is a mere corner.
-_LEAST_PART = 0.004
-# Cost factor of boundary edges for a dividing line, and what a line costs at least, relative to the boundary's length.
-_DETOUR = 10.0
-_LINE_COST = 0.05
-# Costs of edges for flows are integers of about this size.
-_UNIT = 1000.0
-_MOST = 2**30
+
+class CutTuning(NamedTuple):
+    """Numbers that tune how a chart is cut further."""
+
+    # Extensions of cuts: maximum number of peaks that one extension reaches.
+    max_peaks: int = 24
+    # It reaches fewer peaks if less than this share of the area is over the bound.
+    many_over: float = 0.2
+    # Other peaks closer than this multiple of the depth of a peak are not reached by the same extension.
+    near: float = 0.3
+    # Number of averages of the stretch over neighbouring triangles.
+    smoothings: int = 3
+    # Largest stretch in these averages.
+    max_stretch: float = 4.0
+    # Dividing lines: the cost of an edge decreases with the excess of the stretch by this factor.
+    attraction: float = 10.0
+    # A line stays between these values of the relative distance from its two ends.
+    band: tuple[float, float] = (0.25, 0.75)
+    # The band of a large chart is narrowed until it has at most this number of triangles.
+    max_band: int = 6_000
+    # Around each end, up to this distance, triangles belong to the nearer end; the chart has area 1.
+    reach: float = 0.15
+    # Lines between overlapping parts: maximum number of boundary positions that are compared.
+    samples: int = 256
+    # Value of a line that halves the boundary, relative to the share of the crossings that it parts.
+    balance: float = 0.2
+    # A line that leaves one part with more than all but this share of the triangles cuts off a corner only.
+    min_part: float = 0.004
+    # Lines that replace such a line: cost factor of boundary edges.
+    detour: float = 10.0
+    # Minimum cost of a line, relative to the boundary's length.
+    line_cost: float = 0.05
+    # Minimum cuts: costs of edges are integers of about this size.
+    cost_unit: float = 1000.0
+    # Upper bound of the sum of these integers.
+    max_cost: int = 2**30
+
+
+_TUNING = CutTuning()
 
 
 def extend_cuts(chart: WorkingChart, bound: float) -> WorkingChart | None:
@@ -49,7 +63,7 @@ def extend_cuts(chart: WorkingChart, bound: float) -> WorkingChart | None:
     cut = np.zeros(len(graph.ends), dtype=bool)
     excess = _excess(chart, bound)
     left = chart.share_over(bound)
-    most = max(1, int(_MAX_PEAKS * min(left / _MANY_OVER, 1)))
+    most = max(1, int(_TUNING.max_peaks * min(left / _TUNING.many_over, 1)))
     for _ in range(most):
         depth, before = graph.distances(np.flatnonzero(opened), graph.cost)
         score = excess * depth
@@ -59,7 +73,7 @@ def extend_cuts(chart: WorkingChart, bound: float) -> WorkingChart | None:
         path = graph.way_back(before, tip)
         cut[path] = True
         opened |= graph.mark_vertices(cut)
-        near, _ = graph.distances(np.array([tip]), graph.cost, limit=_NEAR * depth[tip])
+        near, _ = graph.distances(np.array([tip]), graph.cost, limit=_TUNING.near * depth[tip])
         excess[np.isfinite(near)] = 0
     if not cut.any():
         return None
@@ -72,7 +86,7 @@ def divide_overlap(chart: WorkingChart) -> list[WorkingChart]:
     graph = _graph(chart)
     one, other = _overlapping_parts(chart)
     parts = _open(chart, _line_between(chart, graph, one, other)[graph.side].T)
-    if max(len(part.F) for part in parts) < (1 - _LEAST_PART) * len(chart.F):
+    if max(len(part.F) for part in parts) < (1 - _TUNING.min_part) * len(chart.F):
         return parts
     # The overlapping parts are so close to each other that the line cuts off a corner only.
     return _open(chart, _line_from(chart, graph, int(one[0]), int(other[0]))[graph.side].T)
@@ -83,22 +97,22 @@ def divide(chart: WorkingChart, bound: float) -> list[WorkingChart]:
     graph = _graph(chart)
     if chart.uv is not None:
         there = _excess(chart, bound)
-        graph.cost[:] /= 1 + _ATTRACTION * there[graph.ends].mean(axis=1)
+        graph.cost[:] /= 1 + _TUNING.attraction * there[graph.ends].mean(axis=1)
     return _open(chart, _line_between(chart, graph, *_far_ends(chart, graph))[graph.side].T)
 
 
 def _excess(chart: WorkingChart, bound: float) -> FloatArray:
     """How much the logarithm of the stretch around each vertex (m,) exceeds the bound, at least 0."""
-    excess = np.log(np.minimum(chart.stretch, _MAX_PEAK)) - np.log(bound)
+    excess = np.log(np.minimum(chart.stretch, _TUNING.max_stretch)) - np.log(bound)
     weight = chart.area
     corners = chart.F.ravel()
     total = np.bincount(corners, np.repeat(weight, 3), minlength=len(chart.V))
     at = np.empty(0)
-    for _ in range(_SMOOTHINGS):
+    for _ in range(_TUNING.smoothings):
         at = np.bincount(corners, np.repeat(weight * excess, 3), minlength=len(chart.V)) / total
         excess = at[chart.F].mean(axis=1)
     # A single triangle must not be lost by the averages.
-    np.maximum.at(at, chart.F[chart.too_long].ravel(), np.log(_MAX_PEAK))
+    np.maximum.at(at, chart.F[chart.too_long].ravel(), np.log(_TUNING.max_stretch))
     return np.maximum(at, 0)
 
 
@@ -122,7 +136,7 @@ def _overlapping_parts(chart: WorkingChart) -> tuple[IntArray, IntArray]:
     place = np.empty(len(chart.V), dtype=np.int64)
     place[loop] = np.arange(loop.size)
     pairs = place[chart.crossings[:, (0, 2)]]
-    count = min(loop.size, _SAMPLES)
+    count = min(loop.size, _TUNING.samples)
     bins = pairs * count // loop.size
     crossed = np.zeros((count, count))
     np.add.at(crossed, (bins[:, 0], bins[:, 1]), 1)
@@ -135,7 +149,7 @@ def _overlapping_parts(chart: WorkingChart) -> tuple[IntArray, IntArray]:
     inside = both[j, j] - both[i, j] - both[j, i] + both[i, i]
     touching = both[j, count] - both[i, count]
     length = np.minimum(j - i, count - (j - i)) / count
-    score = np.where(j > i, (touching - inside) / len(pairs) + _BALANCE * length, -np.inf)
+    score = np.where(j > i, (touching - inside) / len(pairs) + _TUNING.balance * length, -np.inf)
     first, last = np.unravel_index(int(np.argmax(score)), score.shape)
     within = (bins >= first) & (bins < last)
     parted = within[:, 0] != within[:, 1]
@@ -156,10 +170,10 @@ def _line_from(chart: WorkingChart, graph: EdgeGraph, one: int, other: int) -> B
     middle = (i + j) // 2 if place[j] - place[i] <= total / 2 else ((i + j + loop.size) // 2) % loop.size
     arc = np.abs(place[:-1] - place[middle])
     arc = np.minimum(arc, total - arc)
-    weight = np.where(graph.rim, _DETOUR, 1.0) * graph.cost
+    weight = np.where(graph.rim, _TUNING.detour, 1.0) * graph.cost
     far, before = graph.distances(loop[[middle]], weight)
     with np.errstate(all="ignore"):
-        score = np.where(arc > 0, (far[loop] + _LINE_COST * total) / arc, np.inf)
+        score = np.where(arc > 0, (far[loop] + _TUNING.line_cost * total) / arc, np.inf)
     line = mark(len(graph.ends), graph.way_back(before, int(loop[np.argmin(score)])))
     return line & ~graph.rim
 
@@ -178,7 +192,7 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     near, far = (graph.distances(ends, graph.length)[0] for ends in (one, other))
     with np.errstate(all="ignore"):
         t = np.nan_to_num(near / (near + far), nan=0.5)[chart.F].mean(axis=1)
-    k, lowest, highest = len(chart.F), *_BAND
+    k, lowest, highest = len(chart.F), *_TUNING.band
     group = _group_undivided(chart.cost, graph)
     if not group.any():
         # The chart is a single polygon or flat face, which can only be divided between its triangles.
@@ -188,12 +202,12 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     t = _mean_of_groups(t, group)
     inside = np.abs(t - 0.5)
     half = 0.5 * (highest - lowest)
-    if np.count_nonzero(inside < half) > _MAX_BAND:
-        half = float(np.partition(inside, _MAX_BAND)[_MAX_BAND])
+    if np.count_nonzero(inside < half) > _TUNING.max_band:
+        half = float(np.partition(inside, _TUNING.max_band)[_TUNING.max_band])
     # Around the ends, triangles belong to the nearer one, so that no part is tiny.
     near, far = (_mean_of_groups(distance[chart.F].mean(axis=1), group) for distance in (near, far))
-    source = (t <= 0.5 - half) | ((near < _REACH) & (near < far))
-    sink = (t >= 0.5 + half) | ((far < _REACH) & (far <= near))
+    source = (t <= 0.5 - half) | ((near < _TUNING.reach) & (near < far))
+    sink = (t >= 0.5 + half) | ((far < _TUNING.reach) & (far <= near))
     if not source.any() or not sink.any():
         # The chart is so small that no triangle is close to an end.
         order = group[np.argsort(t, kind="stable")]
@@ -203,7 +217,8 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     node = np.where(source, k, np.where(sink, k + 1, group))
     numbers, node = np.unique(np.concatenate([node, [k, k + 1]]), return_inverse=True)
     first, second, edge = _pairs(graph)
-    capacity = np.clip(graph.cost[edge] / np.mean(graph.cost) * _UNIT, 1, _MOST / (len(edge) + 1)).astype(np.int32)
+    most = _TUNING.max_cost / (len(edge) + 1)
+    capacity = np.clip(graph.cost[edge] / np.mean(graph.cost) * _TUNING.cost_unit, 1, most).astype(np.int32)
     a, b = node[first], node[second]
     apart = a != b
     a, b, capacity = a[apart], b[apart], capacity[apart]

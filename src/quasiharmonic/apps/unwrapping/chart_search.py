@@ -9,6 +9,8 @@
                                          ▼
                                        done
 
+Charts that touch themselves along a cut, as parts that unfold without stretch do, are closed there.
+
 All charts together may exceed the bound on one per cent of the surface, so a small chart may exceed it on more.
 """
 
@@ -29,10 +31,14 @@ from quasiharmonic.apps.unwrapping.chart_maps import (
     flatten_chart,
     guard_chart,
 )
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
 from quasiharmonic.apps.unwrapping.joining import join_small_charts
 from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
-from quasiharmonic.apps.unwrapping.slits import close_slits
 from quasiharmonic.apps.unwrapping.teeth import move_teeth
+from quasiharmonic.geometry.exact.certificate import is_injective
+from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.util.arrays import mark
 from quasiharmonic.util.progress import heartbeat, keep_time_limit
 from quasiharmonic.util.threads import HAS_THREADS, count_cores, make_executor
 
@@ -41,26 +47,38 @@ R = TypeVar("R")
 
 Callback = Callable[[str, int, int], object]
 
-# Maximum number of times that charts are cut further to reach the aim, and to keep the bound.
-_FEW_ROUNDS, _MANY_ROUNDS = 12, 24
-# An extension must lower the share over the bound to this fraction, or it has failed.
-_ENOUGH = 0.6
-# A chart is divided after this number of failed extensions.
-_MAX_FAILURES = 1
-# Charts are improved until this fraction of the free share remains, if all improvements succeed.
-_LEFT = 0.8
-# The search first aims at a bound with this fraction of the permitted stretch.
-_AIM = 0.6
-#: Charts of a coarse mesh, whose seams are carried to the surface, only need to keep this fraction there.
+#: The aim for charts of a coarse mesh, whose seams are carried to the surface: this fraction of the permitted stretch.
 AIM_OF_CARRIED = 0.7
-# Overlaps of at most this share of a chart are separated without dividing the chart.
-_SMALL_OVERLAP = 0.005
-# It divides charts to reach its aim only up to this number of charts, plus a multiple of the root of the number of
-# triangles; and to keep the bound up to this number.
-_FEW_CHARTS = 8, 0.125
-_MANY_CHARTS = 64, 4.0
 # Seconds between two calls of the callback while nothing is finished.
 _TICK = 0.25
+# Two sides of a cut lie at the same place if their ends are at most this fraction of their length apart.
+_SAME = 0.01
+
+
+class SearchTuning(NamedTuple):
+    """Numbers that tune the search: first it aims at a lower bound than the given one, then it keeps the given one."""
+
+    # The aim for all other charts, as a fraction of the permitted stretch.
+    aim: float = 0.6
+    # Maximum number of rounds in which charts are cut further to reach the aim.
+    aim_rounds: int = 12
+    # Maximum number of rounds to keep the bound.
+    bound_rounds: int = 24
+    # Maximum number of additional charts to reach the aim, and a multiple of the root of the number of triangles.
+    aim_charts: tuple[int, float] = (8, 0.125)
+    # The same to keep the bound.
+    bound_charts: tuple[int, float] = (64, 4.0)
+    # An extension must lower the share over the bound to this fraction, or it has failed.
+    success: float = 0.6
+    # A chart is divided after this number of failed extensions.
+    max_failures: int = 1
+    # Charts are improved until this fraction of the free share remains, if all improvements succeed.
+    remaining: float = 0.8
+    # Overlaps of at most this share of a chart are separated without dividing the chart.
+    small_overlap: float = 0.005
+
+
+_TUNING = SearchTuning()
 
 
 class Workers:
@@ -149,13 +167,13 @@ def search_charts(
         All have bijective maps.
     """
     carried = any(chart.start is not None for chart in charts)
-    aim = 1 + (1.0 if not joinable else AIM_OF_CARRIED if carried else _AIM) * (bound - 1)
+    aim = 1 + (1.0 if not joinable else AIM_OF_CARRIED if carried else _TUNING.aim) * (bound - 1)
     root = sum(len(chart.F) for chart in charts) ** 0.5
-    few, many = (len(charts) + round(base + share * root) for base, share in (_FEW_CHARTS, _MANY_CHARTS))
+    few, many = (len(charts) + round(base + share * root) for base, share in (_TUNING.aim_charts, _TUNING.bound_charts))
     keep([*charts])
     here = [part for parts in workers.map("flatten", partial(_flatten_first, aim, workers), charts) for part in parts]
     keep(here)
-    for goal, rounds, most in ((aim, _FEW_ROUNDS, few), (bound, _MANY_ROUNDS, many)):
+    for goal, rounds, most in ((aim, _TUNING.aim_rounds, few), (bound, _TUNING.bound_rounds, many)):
         for _ in range(rounds):
             room = (most if max_charts is None else min(max_charts, most)) - len(here)
             chosen = _select(here, goal, total_area)
@@ -195,7 +213,7 @@ def _select(charts: Sequence[WorkingChart], bound: float, total_area: float) -> 
     order = np.argsort(-share, kind="stable")
     rest = np.empty(len(charts))
     rest[order] = share.sum() - np.cumsum(share[order]) + share[order]
-    missed = rest > (_LEFT * FREE_SHARE if share.sum() > FREE_SHARE else np.inf)
+    missed = rest > (_TUNING.remaining * FREE_SHARE if share.sum() > FREE_SHARE else np.inf)
     stretched = [bool(chart.too_long.any() or missed[k]) for k, chart in enumerate(charts)]
     chosen = [k for k, chart in enumerate(charts) if stretched[k] or not chart.bijective]
     return [(k, stretched[k]) for k in sorted(chosen, key=lambda k: (charts[k].bijective, -share[k], k))]
@@ -225,19 +243,56 @@ def _close(chart: WorkingChart, joinable: bool) -> WorkingChart:
     return chart if chart.bijective or not joinable else close_slits(chart) or chart
 
 
+def close_slits(chart: WorkingChart) -> WorkingChart | None:
+    """Close slits: join a chart to itself at boundary edges that are one edge of the surface and lie at the same place.
+
+    The chart may have more holes afterwards. Return None if there are no such edges, or if the joined chart has no
+    injective map.
+    """
+    assert chart.uv is not None
+    size = len(chart.V)
+    tail, head = chart.F.ravel(), chart.F[:, (1, 2, 0)].ravel()
+    rim = np.flatnonzero(~np.isin(tail * size + head, head * size + tail))
+    edge = edge_keys(chart.vertices[tail[rim]], chart.vertices[head[rim]], int(chart.vertices.max()) + 1)
+    order = np.argsort(edge, kind="stable")
+    first = np.flatnonzero(np.diff(edge[order]) == 0)
+    one, other = rim[order[first]], rim[order[first + 1]]
+    z = chart.uv[:, 0] + 1j * chart.uv[:, 1]
+    apart = np.maximum(np.abs(z[tail[one]] - z[head[other]]), np.abs(z[head[one]] - z[tail[other]]))
+    same = (apart <= _SAME * np.abs(z[tail[one]] - z[head[one]])) & (chart.cost.ravel()[one] > DEMANDED_COST)
+    if not same.any():
+        return None
+    cut = mark(chart.F.size, np.setdiff1d(rim, np.concatenate([one[same], other[same]])))
+    on_surface = chart.vertices[chart.F]
+    own, corner = renumber(fans(on_surface, cut.reshape(-1, 3))[0], on_surface)
+    count = np.bincount(own.ravel())
+    uv = np.stack([np.bincount(own.ravel(), chart.uv[chart.F, k].ravel()) / count for k in range(2)], axis=1)
+    origin = chart.F.ravel()[corner]
+    try:
+        closed = WorkingChart(chart.triangles, chart.vertices[origin], chart.V[origin], own, chart.cost)
+    except ValueError:
+        # The surface would have a handle.
+        return None
+    uv = np.ldexp(uv, chart.piece.exponent - closed.piece.exponent)
+    if not is_injective(own, uv):
+        return None
+    closed.use(uv)
+    return closed
+
+
 def _improve(bound: float, workers: Workers, joinable: bool, job: _Job) -> tuple[list[WorkingChart], bool]:
     """Cut a chart once and flatten its parts, or separate overlaps; the flag says that the chart is unchanged."""
     chart = _close(job.chart, joinable)
     if chart is not job.chart:
         return [chart], False
-    apart = chart.bijective or overlapping_share(chart) < _SMALL_OVERLAP
+    apart = chart.bijective or overlapping_share(chart) < _TUNING.small_overlap
     if apart and not job.stretched:
         if separate(chart, bound, workers.check_wanted):
             return [chart], False
         apart = False
-    if apart and chart.failures < _MAX_FAILURES and (longer := extend_cuts(chart, bound)) is not None:
+    if apart and chart.failures < _TUNING.max_failures and (longer := extend_cuts(chart, bound)) is not None:
         parts = _flatten(bound, workers, longer)
-        enough = sum(part.share_over(bound) for part in parts) <= _ENOUGH * chart.share_over(bound)
+        enough = sum(part.share_over(bound) for part in parts) <= _TUNING.success * chart.share_over(bound)
         for part in parts:
             part.failures = 0 if enough else chart.failures + 1
         return parts, False

@@ -20,13 +20,13 @@ from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.layout import LayoutChoice
 from quasiharmonic.apps.unwrapping.mirrored_charts import mirror_charts
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
-from quasiharmonic.apps.unwrapping.unfolding import unfold
+from quasiharmonic.apps.unwrapping.unfolding import unfold_small_components
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.geometry.mesh.fans import fans, renumber, split_parts
-from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
-from quasiharmonic.geometry.mesh.topology import are_sides, boundary_edges, edge_keys
+from quasiharmonic.geometry.mesh.fans import fans, split_parts
+from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.topology import are_sides, boundary_edges
 from quasiharmonic.targets.cuts.find import find_cuts_by
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, mark, repeat_each, scale_to_unit
 
@@ -34,8 +34,6 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_in
 MAX_STRETCH = 1.5
 # Minimum gain of the first cuts; see `find_cuts`.
 _MIN_GAIN = 0.1
-# Closed components of at most this number of triangles, with at most this share of the area, become one chart each.
-_SMALL, _SMALL_SHARE = 24, 0.01
 # The first cuts may be longer by this factor if they are mirrored; seams are then longer by up to about a quarter.
 _GROWTH = 1.6
 
@@ -177,7 +175,7 @@ def _develop(
 ) -> tuple[BoolArray, list[Chart]]:
     """Make charts of the developable parts; return a mask (f,) of their triangles, and the charts."""
     undivided = cost >= UNDIVIDED_COST
-    mask, charts = _unfold_small(V, F, undivided, cost <= DEMANDED_COST)
+    mask, charts = unfold_small_components(V, F, undivided, cost <= DEMANDED_COST)
     rows = np.flatnonzero(~mask)
     if not rows.size:
         return mask, charts
@@ -215,34 +213,6 @@ def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, lis
         charts.append(Chart(rows_of, own_of, origin, uv[first[k] : first[k + 1]], np.ones(len(rows_of)), 0.0))
     mask = np.zeros(len(F), dtype=bool)
     mask[rows] = flat[component]
-    return mask, charts
-
-
-def _unfold_small(
-    V: FloatArray, F: IntArray, undivided: BoolArray, demanded: BoolArray
-) -> tuple[BoolArray, list[Chart]]:
-    """Unfold small closed components without cuts; return a mask (f,) of their triangles, and their charts."""
-    mask, charts = np.zeros(len(F), dtype=bool), list[Chart]()
-    component = fans(F)[1]
-    chosen = np.bincount(component) <= _SMALL
-    if not chosen.any():
-        return mask, charts
-    area = np.linalg.norm(area_vectors(V, F), axis=1)
-    chosen &= np.bincount(component, area) <= _SMALL_SHARE * area.sum()
-    sides = edge_keys(F, F[:, (1, 2, 0)], len(V))
-    _, edge, times = np.unique(sides, return_inverse=True, return_counts=True)
-    chosen[component[((times[edge].reshape(sides.shape) < 2) | demanded).any(axis=1)]] = False
-    rows = np.flatnonzero(chosen[component])
-    if not rows.size:
-        return mask, charts
-    split, component, uv, good = unfold(V, F[rows], undivided[rows])
-    order = np.argsort(component, kind="stable")
-    for k, some in enumerate(np.split(order, np.flatnonzero(np.diff(component[order])) + 1)):
-        if good[k]:
-            own, corner = renumber(split[some], F[rows[some]])
-            vertices = F[rows[some]].ravel()[corner]
-            charts.append(Chart(rows[some], own, vertices, uv[split[some].ravel()[corner]], np.ones(some.size), 0.0))
-    mask[rows[good[component]]] = True
     return mask, charts
 
 

@@ -33,9 +33,13 @@ from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at, to_complex, to_points
 
-# Number of fits to rotated triangles, and least and largest number of all fits.
-_FITS, _LEAST_FITS, _MOST_FITS = 4, 6, 16
-# A fit permits this share of the stretch that the bound permits.
+# Number of first fits, to rotated triangles. Later fits permit some stretch.
+_ROTATED_FITS = 4
+# Least number of all fits, after which the search stops when the bound is kept.
+_LEAST_FITS = 6
+# Largest number of all fits.
+_MOST_FITS = 16
+# A later fit permits this share of the stretch that the bound permits.
 _PERMITTED = 0.5
 # A triangle whose singular values have a smaller ratio gets a new rotation.
 _LEAST_RATIO = 0.15
@@ -141,7 +145,7 @@ def _fit(
         if k == _MOST_FITS or (k >= _LEAST_FITS and area[~good].sum() <= FREE_SHARE * area.sum()):
             break
         # At first the targets are rotations, then the nearest matrices with little stretch.
-        less = 1.0 if k < _FITS else most
+        less = 1.0 if k < _ROTATED_FITS else most
         rotation, collapsed = _direction(p), smaller <= _LEAST_RATIO * larger
         larger, smaller = np.clip(larger, 1 / less, less), np.clip(smaller, 1 / less, less)
         if collapsed.any():

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, find_hinges
-from quasiharmonic.apps.unwrapping.layout import LayoutChoice
+from quasiharmonic.apps.unwrapping.layout import MAX_COMPARED, LayoutChoice
 from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
@@ -17,13 +18,27 @@ from quasiharmonic.geometry.mesh.fans import renumber
 from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, to_points
 
-# Pieces are joined in several rounds. In each, unions are at most so long, in sides of the texture, and their boxes may
-# exceed those of their parts by a fraction.
-_ROUNDS = ((0.25, 0.02), (0.45, 0.02), (0.8, 0.02), (0.8, 0.3), (1.2, 1.0))
-# More charts are not joined to unions with much larger boxes, because their layouts are not compared.
-_CAUTIOUS, _FEW = 0.02, 150
+
+class JoiningRound(NamedTuple):
+    """Limits of the unions of charts in one round of joining, as in `PaperModel.join`."""
+
+    longest: float  # Largest length of a union, in sides of the expected texture
+    loss: float  # By which fraction the box of a union may be larger than the boxes of its parts
+
+
+# The rounds, in this order.
+_ROUNDS = (
+    JoiningRound(0.25, 0.02),
+    JoiningRound(0.45, 0.02),
+    JoiningRound(0.8, 0.02),
+    JoiningRound(0.8, 0.3),
+    JoiningRound(1.2, 1.0),
+)
 # Limits at which charts are joined only where they must be.
-_ONLY_FORCED = (0.0, -1.0)
+_ONLY_FORCED = JoiningRound(0.0, -1.0)
+# Rounds with a larger loss than this are left out if there are more charts than `MAX_COMPARED`: the choice between
+# lists of charts would not notice that the union of two charts uses the texture worse.
+_SMALL_LOSS = 0.02
 
 
 def develop_charts(
@@ -81,7 +96,7 @@ def develop_charts(
     known: dict[int, Chart] = {}
     found = [_list_charts(F, model, pieces, known)]
     for longest, loss in _ROUNDS:
-        if loss > _CAUTIOUS and (len(found[-1]) > _FEW or (choose is not None and not choose.generous)):
+        if loss > _SMALL_LOSS and (len(found[-1]) > MAX_COMPARED or (choose is not None and not choose.generous)):
             break
         model.join(weight, together, longest, loss, check_wanted)
         found.append(_list_charts(F, model, pieces, known))

@@ -15,12 +15,16 @@ from quasiharmonic.apps.unwrapping.rounding import round_positions
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
-# From this loss on, unions with much larger boxes are compared, too.
+# Above this loss, lists with unions that have much larger boxes than their parts are compared, too.
 _GENEROUS = 0.05
-# From this share of straight outlines on, the share may be smaller by a difference.
-_MOSTLY_STRAIGHT, _BENT = 0.87, 0.03
-# More charts are not packed for comparison. A layout that uses this share of the texture is good enough.
-_MOST_COMPARED, _GOOD_USE = 150, 0.83
+# If at least this share of the outlines of a list lies along the axes, so must those of the list that is returned.
+_MOSTLY_STRAIGHT = 0.87
+# Their share may be smaller by this difference.
+_BENT = 0.03
+#: Lists with more charts than this are not packed for comparison.
+MAX_COMPARED = 150
+# A layout that uses this share of the texture is good enough: no further list is compared.
+_GOOD_USE = 0.83
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +94,7 @@ class LayoutChoice:
             count = len(found[k])
             charts = self.divide(found[k], V, cost)
             covered = 0.0
-            if len(charts) <= _MOST_COMPARED:
+            if len(charts) <= MAX_COMPARED:
                 shapes, above = [chart.shape for chart in charts], max(use + self.loss, 0.0)
                 covered = estimate_use(shapes, self.size, self.padding, self.tiles, rotate=self.rotate, above=above)
             if use < 0 or covered > use + self.loss:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,15 +14,31 @@ from quasiharmonic.geometry.mesh.topology import find_pairs, label_components
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.progress import heartbeat
 
-# Share of the texture that charts are expected to cover.
-_EXPECTED = 0.6
-# Longest chart in sides of the texture at this scale, and longest chart that covers less than a share of its box.
-_LONGEST, _LONGEST_LOOSE, _LOOSE = 0.85, 0.7, 0.6
-# The same for charts without stretch, for those with almost all of the area, and for cuts through flat faces. Each part
-# must be this much shorter.
-_LONGEST_ISOMETRIC, _LONGEST_ALONE, _LONGEST_FLAT = 0.95, 1.3, 2.0
-_ALONE = 0.9
-_SHORTER = 0.85
+
+class LengthTuning(NamedTuple):
+    """Numbers that tune which charts are too long; lengths are in sides of the texture at the expected scale."""
+
+    # Share of the texture that charts are expected to cover, which determines this scale.
+    expected_use: float = 0.6
+    # Longest chart.
+    longest: float = 0.85
+    # A chart is loose if it covers less than this share of its box.
+    loose: float = 0.6
+    # Longest loose chart.
+    longest_loose: float = 0.7
+    # Longest chart without stretch, and longest rectangle, unless they are divided like the others.
+    longest_fixed: float = 0.95
+    # Such a chart is alone if it has more than this share of the area.
+    alone: float = 0.9
+    # Longest chart that is alone.
+    longest_alone: float = 1.3
+    # Longest chart without stretch that is not cut through its flat faces.
+    longest_flat: float = 2.0
+    # If such a chart is halved, each part must have at most this multiple of its length.
+    shorter: float = 0.85
+
+
+_TUNING = LengthTuning()
 
 
 def divide_long_charts(
@@ -67,8 +84,8 @@ def divide_long_charts(
     """
     area = sum(chart.shape.area for chart in charts)
     ratio = max(size) / min(size)
-    side = float(np.sqrt(area * ratio / (_EXPECTED * tiles)))
-    longest_flat = _LONGEST_FLAT * side
+    side = float(np.sqrt(area * ratio / (_TUNING.expected_use * tiles)))
+    longest_flat = _TUNING.longest_flat * side
     if density is not None:
         side = min(side, max(size) / density)
         longest_flat = min(longest_flat, max(size) / density)
@@ -120,18 +137,18 @@ def _halve(chart: Chart, cost: FloatArray) -> list[Chart]:
     if first.all() or not first.any():
         return []
     parts = [part for rows in (np.flatnonzero(first), np.flatnonzero(~first)) for part in chart.take(rows)]
-    return parts if max(map(_length, parts)) <= _SHORTER * _length(chart) else []
+    return parts if max(map(_length, parts)) <= _TUNING.shorter * _length(chart) else []
 
 
 def _is_too_long(chart: Chart, side: float, area: float, for_packing: bool) -> bool:
     """Whether a chart prevents a scale at which the texture has this side."""
     if _is_fixed(chart, for_packing):
-        longest = _LONGEST_ALONE if chart.shape.area > _ALONE * area else _LONGEST_ISOMETRIC
+        longest = _TUNING.longest_alone if chart.shape.area > _TUNING.alone * area else _TUNING.longest_fixed
         return _length(chart) > longest * side
     shape = chart.shape
     width, height = shape.extent(shape.direction)
-    loose = shape.area < _LOOSE * width * height
-    return max(width, height) > side * (_LONGEST_LOOSE if loose else _LONGEST)
+    loose = shape.area < _TUNING.loose * width * height
+    return max(width, height) > side * (_TUNING.longest_loose if loose else _TUNING.longest)
 
 
 def _is_fixed(chart: Chart, for_packing: bool) -> bool:

@@ -7,6 +7,7 @@ smaller angles, down to a few degrees; there, only large and compact parts are p
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -25,29 +26,48 @@ from quasiharmonic.util.progress import heartbeat
 
 #: Edges with a larger angle between the normals are creases. Those of a cylinder with twelve sides, 30°, are not.
 CREASE = np.deg2rad(30.01)
-# Smaller angles at which curved parts are divided.
-_ANGLES = np.deg2rad([20.0, 13.0, 9.0, 6.0, 4.0])
-# There, a piece has at least this share of the area, and its squared perimeter is at most this multiple of its area.
-_LEAST_SHARE, _LONGEST = 0.15, 40.0
-# Between creases, a piece with at least this share of the area is kept in any case.
-_LARGE_SHARE = 0.2
-# Smaller ones are kept unless at half of their corners many pieces meet, as on a rough scan, or three or four pieces
-# with little curvature, in radians, as on a coarse sphere.
-_ROUGH, _MANY, _ROUND = 0.5, 5, {3: 0.45, 4: 0.8}
-# Pieces with a smaller share of the area are dropped if they mostly border on curved parts.
-_SMALL_SHARE = 0.02
-# Largest angle defect of a vertex of a developable piece, and of all its vertices together, in radians.
-_DEFECT, _ALL_DEFECTS = 1e-3, 0.1
-# A piece may have this number of vertices with larger defects, such as the apex of a cone. They are cut open.
-_APEXES = 2
-# Factor on the cost of cutting an edge that is its own mirror image.
-_ON_PLANE = 0.9
-# Largest stretch of an unrolled piece.
-_STRETCH = 1.001
-# Vertices of a piece that touch, up to this fraction of a typical edge, are moved inward by a fraction of their edges.
-_TOUCHING, _APART = 1e-5, 2e-4
-# Positions are compared on a grid that contains no simple fractions.
-_OFFSET = 0.3819
+
+
+class PieceTuning(NamedTuple):
+    """Numbers that tune what counts as a developable piece; angles are in radians, shares are those of the area."""
+
+    # Largest angle defect of a vertex of a developable piece.
+    defect: float = 1e-3
+    # Largest sum of the defects of all its vertices.
+    all_defects: float = 0.1
+    # A piece may have this number of vertices with larger defects, such as the apex of a cone. They are cut open.
+    apexes: int = 2
+    # A corner is rough if at least this number of pieces meets there, as on a rough scan.
+    many_pieces: int = 5
+    # A corner is also rough if three pieces meet there with less curvature than this, as on a coarse sphere.
+    little_at_three: float = 0.45
+    # The same for four pieces.
+    little_at_four: float = 0.8
+    # A piece is rough if more than this share of its corners is rough. Rough pieces between creases are not kept.
+    rough: float = 0.5
+    # But pieces between creases with at least this share are kept in any case.
+    large_share: float = 0.2
+    # Curved parts are divided at these angles, smaller than `CREASE`; in degrees.
+    angles: tuple[float, ...] = (20.0, 13.0, 9.0, 6.0, 4.0)
+    # There, a piece has at least this share.
+    min_share: float = 0.15
+    # There, the squared perimeter of a piece is at most this multiple of its area.
+    max_perimeter: float = 40.0
+    # Pieces with a smaller share are dropped if they mostly border on curved parts.
+    small_share: float = 0.02
+    # Factor on the cost of cutting an edge that is its own mirror image.
+    on_plane: float = 0.9
+    # Largest stretch of an unrolled piece.
+    max_stretch: float = 1.001
+    # Vertices of a piece touch if they are at most this fraction of a typical edge apart.
+    touching: float = 1e-5
+    # Vertices that touch are moved inward by this fraction of their edges.
+    apart: float = 2e-4
+    # Shift of the grid on which positions are compared, so that it contains no simple fractions.
+    grid_shift: float = 0.3819
+
+
+_TUNING = PieceTuning()
 
 
 @dataclass(eq=False)
@@ -96,20 +116,20 @@ class _Parts:
         rim[np.roll(self.split, -1, axis=1)[open_sides]] = True
         total = np.bincount(self.split.ravel(), angles.ravel(), number)
         defect = np.where(rim, 0.0, np.abs(2 * np.pi - total))
-        self.apexes = np.flatnonzero(defect > _DEFECT)
-        few = np.bincount(part[self.apexes], minlength=self.count) <= _APEXES
-        curved = np.bincount(part, np.where(defect > _DEFECT, 0.0, defect), self.count) > _ALL_DEFECTS
+        self.apexes = np.flatnonzero(defect > _TUNING.defect)
+        few = np.bincount(part[self.apexes], minlength=self.count) <= _TUNING.apexes
+        curved = np.bincount(part, np.where(defect > _TUNING.defect, 0.0, defect), self.count) > _TUNING.all_defects
         self.developable = mark(self.count, part[rim]) & few & ~curved
         # The number of parts around a vertex, at each vertex of a part's rim.
         at = np.zeros(number, dtype=np.int64)
         at[self.split] = F
         around = np.bincount(at)[at]
         curvature = np.abs(2 * np.pi - np.bincount(at, total))[at]
-        little = np.where(around == 3, _ROUND[3], _ROUND[4])
-        rounded = (curvature > _DEFECT) & (curvature < little)
+        little = np.where(around == 3, _TUNING.little_at_three, _TUNING.little_at_four)
+        rounded = (curvature > _TUNING.defect) & (curvature < little)
         corner = rim & (around >= 3)
-        rough = np.bincount(part[corner], (rounded | (around >= _MANY))[corner], self.count)
-        self.rough = rough > _ROUGH * np.bincount(part[corner], minlength=self.count)
+        rough = np.bincount(part[corner], (rounded | (around >= _TUNING.many_pieces))[corner], self.count)
+        self.rough = rough > _TUNING.rough * np.bincount(part[corner], minlength=self.count)
 
     def find_cut(self, hinges: Hinges, k: int, here: IntArray, cost: FloatArray) -> IntArray:
         """Return the cheapest cut among hinges ``here`` of part ``k`` that gives a disk, its apexes on the boundary."""
@@ -131,7 +151,7 @@ def _cut_costs(hinges: Hinges, cost: FloatArray, image: IntArray | None) -> Floa
     # A cut along an edge inside a flat face would end there.
     dear[hinges.flat] *= UNDIVIDED_COST
     if image is not None:
-        dear[image == np.arange(image.size)] *= _ON_PLANE
+        dear[image == np.arange(image.size)] *= _TUNING.on_plane
     return dear
 
 
@@ -140,7 +160,7 @@ def _drop_scattered(hinges: Hinges, parts: _Parts, chosen: BoolArray, rim: Float
     one, other = parts.component[hinges.first], parts.component[hinges.second]
     apart = one != other
     one, other, length = one[apart], other[apart], hinges.length[apart]
-    large = parts.area >= _SMALL_SHARE
+    large = parts.area >= _TUNING.small_share
     single = np.bincount(parts.component, minlength=parts.count) == 1
     while True:
         firm = chosen & ~single
@@ -172,7 +192,7 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
     angles, whole = corner_angles(shapes.sides), surface_area(V, F)
     length = np.linalg.norm(V[F] - V[np.roll(F, -1, axis=1)], axis=2)
     found = Pieces(np.full(len(F), -1), np.zeros(F.shape, dtype=np.complex128), np.zeros(hinges.one.size, dtype=bool))
-    for angle in (CREASE, *_ANGLES, 0.0):
+    for angle in (CREASE, *np.deg2rad(_TUNING.angles), 0.0):
         heartbeat()
         rest = found.label < 0
         within = ~apart & rest[hinges.first] & rest[hinges.second]
@@ -183,10 +203,10 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
         outline = np.where(hinges.mark_sides(joined, len(F)), 0.0, length)
         rim: FloatArray = np.bincount(parts.component, outline.sum(axis=1), parts.count).astype(np.float64)
         if angle == CREASE:
-            chosen &= ~parts.rough | (parts.area >= _LARGE_SHARE)
+            chosen &= ~parts.rough | (parts.area >= _TUNING.large_share)
             chosen = _drop_scattered(hinges, parts, chosen, rim)
         elif angle:
-            chosen &= (parts.area >= _LEAST_SHARE) & (rim**2 <= _LONGEST * parts.area * whole)
+            chosen &= (parts.area >= _TUNING.min_share) & (rim**2 <= _TUNING.max_perimeter * parts.area * whole)
         if chosen.any():
             _unroll(V, F, hinges, parts, chosen, cost, found, mirror)
         if (found.label >= 0).all():
@@ -255,8 +275,10 @@ def _separate_touching(z: ComplexArray, F: IntArray, part: IntArray) -> ComplexA
     """Return positions (n,) at which no part touches itself in a vertex, given the part of each triangle (f, 3)."""
     owner = np.empty(len(z), dtype=np.int64)
     owner[F] = part[:, None]
-    unit = _TOUCHING * np.sqrt(np.abs(z).max() ** 2 / len(z))
-    key = np.stack([owner, *(np.floor(x / unit + _OFFSET).astype(np.int64) for x in (z.real, z.imag))], axis=1)
+    unit = _TUNING.touching * np.sqrt(np.abs(z).max() ** 2 / len(z))
+    key = np.stack(
+        [owner, *(np.floor(x / unit + _TUNING.grid_shift).astype(np.int64) for x in (z.real, z.imag))], axis=1
+    )
     _, at, times = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     touching = (times > 1)[at.ravel()]
     if not touching.any():
@@ -268,7 +290,7 @@ def _separate_touching(z: ComplexArray, F: IntArray, part: IntArray) -> ComplexA
     np.minimum.at(least, F, shortest[:, None])
     step = np.bincount(F.ravel(), inward.real.ravel()) + 1j * np.bincount(F.ravel(), inward.imag.ravel())
     length = np.maximum(np.abs(step), np.finfo(float).tiny)
-    return np.where(touching, z + _APART * least * step / length, z)
+    return np.where(touching, z + _TUNING.apart * least * step / length, z)
 
 
 def _is_stretched(V: FloatArray, F: IntArray, uv: FloatArray) -> BoolArray:
@@ -277,7 +299,7 @@ def _is_stretched(V: FloatArray, F: IntArray, uv: FloatArray) -> BoolArray:
     with np.errstate(all="ignore"):
         high, low = measured.sigma1, measured.sigma2
         middle = np.median(high)
-        return ~(np.maximum(high / middle, middle / low) <= _STRETCH)
+        return ~(np.maximum(high / middle, middle / low) <= _TUNING.max_stretch)
 
 
 def _lay(V: FloatArray, F: IntArray, hinges: Hinges, inside: BoolArray) -> ComplexArray:

@@ -21,9 +21,16 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, rep
 _MAX_TRIANGLES = 16
 
 # Score of a pair at an edge of several triangles, lower is better. The cosine of the angle between the triangles is -1
-# if the surface is flat there and 1 if it is folded. The penalties exceed this range, so that they take precedence. At
-# equal angles a convex edge is preferred, which separates solids that touch along an edge.
-_CONCAVE, _UNLIKE, _FOREIGN, _FLIMSY = 1e-3, 4.0, 8.0, 16.0
+# if the surface is flat there and 1 if it is folded. The penalties exceed this range, so that they take precedence.
+#
+# The orientations of the two triangles disagree.
+_DISAGREEING = 4.0
+# The triangles have different vertices of the file at the edge.
+_FOREIGN = 8.0
+# One of the triangles is so thin that its angle is arbitrary.
+_THIN = 16.0
+# At equal angles a convex edge is preferred, which separates solids that touch along an edge.
+_CONCAVE = 1e-3
 
 # Relative difference of two areas that is due to rounding.
 _ROUNDING = 1e-12
@@ -200,7 +207,7 @@ def _pair(
     one, other = np.concatenate(picks).T
     edge = repeat_each(np.arange(count.size), count)[one]
     score = _score_pairs(points, F, corners, turned, crowded[one], crowded[other])
-    score += _FLIMSY * (thin[crowded[one] // 3] | thin[crowded[other] // 3])
+    score += _THIN * (thin[crowded[one] // 3] | thin[crowded[other] // 3])
     order = np.lexsort((other, one, score, edge))
     edge, one, other = edge[order], one[order], other[order]
     free, chosen = np.ones(crowded.size, dtype=bool), []
@@ -236,7 +243,7 @@ def _score_pairs(
         [np.where(tail[side] == end, in_file[side], ahead[side]) for side in (one, other)] for end in (low, high)
     )
     foreign = (low_in_file[0] != low_in_file[1]) | (high_in_file[0] != high_in_file[1])
-    score: FloatArray = (inward * outward).sum(axis=1) + _UNLIKE * unlike + _FOREIGN * foreign
+    score: FloatArray = (inward * outward).sum(axis=1) + _DISAGREEING * unlike + _FOREIGN * foreign
     return score + np.where(unlike, 0.0, _CONCAVE * (normal * outward).sum(axis=1))
 
 

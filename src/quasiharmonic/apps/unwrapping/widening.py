@@ -13,14 +13,24 @@ from quasiharmonic.geometry.mesh.reference import flat_triangles, rest_frames
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
-# A triangle is thin if its height is smaller than this multiple of its longest side, which flattening cannot cope with,
-# or of the root of the surface's area, which is a few units of the precision of texture coordinates.
-_THIN, _LOW = 1e-7, 2.0**-22
-# Its vertex moves by about this multiple of the shortest edge there. The new height is at least this multiple of the
-# root of the area, except where the longest side is small.
-_SHIFT, _HIGH = 1e-3, 2.0**-17
-# Triangles with a larger height, relative to their longest side, are small and not thin.
-_SMALL = 1e-3
+
+class WideningTuning(NamedTuple):
+    """Numbers that tune which triangles are thin, and how far their vertices move."""
+
+    # A triangle is thin if its height is smaller than this multiple of its longest side: flattening fails for these.
+    thin: float = 1e-7
+    # It is also thin if its height is smaller than this multiple of the root of the surface's area, which is a few
+    # units of the precision of texture coordinates,
+    thin_by_area: float = 2.0**-22
+    # unless its height is larger than this multiple of its longest side: then the triangle is only small.
+    small: float = 1e-3
+    # The vertex of a thin triangle moves by about this multiple of the shortest edge there.
+    shift: float = 1e-3
+    # The new height is at least this multiple of the root of the area, except where the longest side is small.
+    shift_by_area: float = 2.0**-17
+
+
+_TUNING = WideningTuning()
 
 
 class Widened(NamedTuple):
@@ -65,48 +75,42 @@ def widen(points: FloatArray, F: IntArray, dimension: int) -> Widened:
     area = base * tip.imag
     sides = np.stack([base, np.abs(tip - base), np.abs(tip)], axis=1)
     flat = (base == 0) | (tip.imag == 0)
-    size = np.sqrt(np.abs(area).sum() / 2)
-    longest = sides.max(axis=1)
-    thin = flat | (area < np.maximum(_THIN * longest, np.minimum(_LOW * size, _SMALL * longest)) * longest)
-    moved = np.zeros(len(points), dtype=bool)
+    size, longest = np.sqrt(np.abs(area).sum() / 2), sides.max(axis=1)
+    thin_height = np.maximum(_TUNING.thin * longest, np.minimum(_TUNING.thin_by_area * size, _TUNING.small * longest))
+    thin = flat | (area < thin_height * longest)
     if not thin.any():
-        return Widened(points, moved, thin, flat, area)
-    degenerate, proper = np.zeros(len(F), dtype=bool), flat.copy()
-    some = np.flatnonzero(flat)
-    corners = points[F[some]]
-    degenerate[some] = (corners == corners[:, (1, 2, 0)]).all(axis=2).any(axis=1)
-    proper &= ~degenerate
-    if proper.any():
-        degenerate |= proper & ~_joins(F, sides, proper, ~degenerate)
+        return Widened(points, mark(len(points)), thin, flat, area)
+    degenerate = _find_degenerate(points, F, sides, flat)
     thin &= ~degenerate
     rows = np.flatnonzero(thin)
-    side = sides[rows].argmax(axis=1)
+    longest, side = longest[rows], sides[rows].argmax(axis=1)
     # Side k runs from corner k to the next, so the corner before k is opposite.
-    apex = F[rows, side - 1]
-    moved[apex] = True
+    start, end, apex = F[rows, side], F[rows, (side + 1) % 3], F[rows, side - 1]
+    moved = mark(len(points), apex)
     near = np.flatnonzero(moved[F].any(axis=1) & ~degenerate)
-    shortest = np.full(len(points), np.inf)
-    for k in range(3):
-        np.minimum.at(shortest, F[near, k], np.minimum(sides[near, k], sides[near, k - 1]))
     # More than the height of a thin triangle, so that none is thin afterwards.
-    base = longest[rows]
-    length = np.maximum(
-        _SHIFT * shortest[apex], np.maximum(4 * _THIN * base, np.minimum(_HIGH * size, 4 * _SMALL * base))
+    least = np.maximum(
+        4 * _TUNING.thin * longest, np.minimum(_TUNING.shift_by_area * size, 4 * _TUNING.small * longest)
     )
-    start, end = F[rows, side], F[rows, (side + 1) % 3]
-    along = points[end] - points[start]
-    points = points.copy()
-    # Away from the triangle at the longest side, or towards that at another side: in their planes, so flat faces stay
-    # flat.
-    ordinary = F[~thin & ~degenerate]
-    across = -_towards_tips(points, ordinary, start, end)
-    for one, other in ((end, apex), (apex, start)):
-        across = np.where(np.isnan(across), _towards_tips(points, ordinary, one, other), across)
-    across = np.where(np.isnan(across), _direction_across(along, dimension), across)
+    length = np.maximum(_TUNING.shift * _shortest_sides(len(points), F[near], sides[near])[apex], least)
+    across = _find_directions(points, F[~thin & ~degenerate], start, end, apex, dimension)
     # Random shifts do not put several vertices on one line again. The seed is fixed, so that results are reproducible.
+    points = points.copy()
     points[apex] += across * (length * np.random.default_rng(0).uniform(0.5, 1, rows.size))[:, None]
     degenerate[near[flat_triangles(points, F[near])]] = True
     return Widened(points, moved, thin & ~degenerate, degenerate, area)
+
+
+def _find_degenerate(points: FloatArray, F: IntArray, sides: FloatArray, flat: BoolArray) -> BoolArray:
+    """Return which of the flat triangles (f,) have two corners at one position, or do not join others."""
+    degenerate = np.zeros(len(F), dtype=bool)
+    some = np.flatnonzero(flat)
+    corners = points[F[some]]
+    degenerate[some] = (corners == corners[:, (1, 2, 0)]).all(axis=2).any(axis=1)
+    proper = flat & ~degenerate
+    if proper.any():
+        degenerate |= proper & ~_joins(F, sides, proper, ~degenerate)
+    return degenerate
 
 
 def _joins(F: IntArray, sides: FloatArray, flat: BoolArray, present: BoolArray) -> BoolArray:
@@ -129,6 +133,28 @@ def _joins(F: IntArray, sides: FloatArray, flat: BoolArray, present: BoolArray) 
     joins = np.zeros(len(F), dtype=bool)
     joins[near] = good & has_area[part] & flat[near]
     return joins
+
+
+def _shortest_sides(n: int, F: IntArray, sides: FloatArray) -> FloatArray:
+    """Return the length of the shortest side (k, 3) of the triangles at each vertex (n,); inf without triangles."""
+    shortest = np.full(n, np.inf)
+    for k in range(3):
+        np.minimum.at(shortest, F[:, k], np.minimum(sides[:, k], sides[:, k - 1]))
+    return shortest
+
+
+def _find_directions(
+    points: FloatArray, ordinary: IntArray, start: IntArray, end: IntArray, apex: IntArray, dimension: int
+) -> FloatArray:
+    """Return the unit vectors (k, 3) along which the vertices ``apex`` move away from the sides ``start → end``.
+
+    They point away from the ordinary triangle at the longest side, or towards that at another side. They are in the
+    plane of this triangle, so that flat faces stay flat.
+    """
+    across = -_towards_tips(points, ordinary, start, end)
+    for one, other in ((end, apex), (apex, start)):
+        across = np.where(np.isnan(across), _towards_tips(points, ordinary, one, other), across)
+    return np.where(np.isnan(across), _direction_across(points[end] - points[start], dimension), across)
 
 
 def _towards_tips(points: FloatArray, F: IntArray, start: IntArray, end: IntArray) -> FloatArray:

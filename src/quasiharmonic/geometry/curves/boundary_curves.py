@@ -111,14 +111,14 @@ class BoundaryCurves:
         on = {int(v): k for k, loop in enumerate(loops) for v in loop}
         return cls([uv[loop] for loop in loops], on=on, fixed=fixed)
 
-    def fix_if_not_sliding(self, vertices: IntArray) -> BoundaryCurves:
+    def with_fixed_unless_on(self, vertices: IntArray) -> BoundaryCurves:
         """Return a copy with more fixed vertices, except those in ``on``."""
         return self._copy_with(
             self.on, np.union1d(self.fixed, np.setdiff1d(vertices, index_array("on", list(self.on))))
         )
 
     def with_fixed(self, vertices: IntArray) -> BoundaryCurves:
-        """Return a copy with more fixed vertices, also such that are in ``on``."""
+        """Return a copy with more fixed vertices, also those in ``on``."""
         return self._copy_with(self.on, np.union1d(self.fixed, vertices))
 
     def restrict(self, used: IntArray) -> BoundaryCurves:
@@ -170,7 +170,7 @@ class BoundaryCurves:
         return Track(chains, positions)
 
     def find_off_curves(self, loops: Sequence[IntArray], uv: FloatArray) -> IntArray:
-        """Boundary vertices that are on no curve and are fixed; checks the vertices in ``on`` as `lay` does."""
+        """Return the boundary vertices on no curve, which are fixed; check the vertices in ``on`` as `lay` does."""
         boundary, curve, _ = self._assign_curves(loops, uv)
         return np.setdiff1d(np.concatenate(loops), boundary[curve >= 0])
 

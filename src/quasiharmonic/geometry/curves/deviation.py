@@ -43,9 +43,9 @@ class DeviationBarrier:
     """
 
     def __init__(self, track: Track, loops: Sequence[IntArray], *, exactly: bool = False) -> None:
-        # Maximum deviation of an edge relative to the largest initial deviation.
         # Squared deviations below this fraction of the squared size of the curve are rounding: the curve is straight.
         straight = 1e-18
+        # Maximum deviation of an edge relative to the largest initial deviation.
         max_growth = 1.2
         following = {int(i): int(j) for loop in loops for i, j in zip(loop, np.roll(loop, -1), strict=True)}
         number = {int(v): k for k, v in enumerate(track.vertices)}

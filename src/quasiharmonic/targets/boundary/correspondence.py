@@ -1,4 +1,9 @@
-"""Correspondence between boundary vertices and positions on an outline."""
+"""Correspondence between the vertices of a boundary loop and the points of an outline.
+
+Both curves have a parameter, the arc length from their start divided by their total length. `arc_length` gives every
+vertex the point with the same parameter, except that the corners of the outline are met by vertices. `find_start`
+chooses the vertex that goes to the start of the outline.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +19,8 @@ from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
 from quasiharmonic.targets.outlines.contours import check_contour, corners, signed_area
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe
 
-# Vertices of a loop with their parameters along a contour.
-Held = Sequence[tuple[int, float]]
+#: Pins of a loop: vertices with given parameters along a contour, in order around.
+LoopPins = Sequence[tuple[int, float]]
 
 
 def arc_length(
@@ -64,11 +69,11 @@ def arc_length(
         start = find_start(s, project_loop(points, contour), contour)
     elif not isinstance(start, Integral) or not 0 <= start < n:
         raise ValueError(f"start = {describe(start)}, but the loop has vertices 0 to {n - 1}")
-    return points_at(contour, places_along(s, contour, [(start, 0.0)], corner_angle=corner_angle))
+    return points_at(contour, find_parameters(s, contour, [(start, 0.0)], corner_angle=corner_angle))
 
 
-def places_along(
-    s: FloatArray, contour: FloatArray, pins: Held, *, corner_angle: float, names: IntArray | None = None
+def find_parameters(
+    s: FloatArray, contour: FloatArray, pins: LoopPins, *, corner_angle: float, names: IntArray | None = None
 ) -> FloatArray:
     """Find parameters along a contour for a loop with given pins; each corner gets the vertex nearest along the loop.
 
@@ -80,7 +85,7 @@ def places_along(
     names = np.arange(len(s)) if names is None else names
     t = arc_parameters(contour)
     sharp = corners(contour, corner_angle)
-    place = np.empty(len(s))
+    parameters = np.empty(len(s))
     for stretch in stretches(s, pins):
         here, wanted = stretch.find_inside(t, sharp)
         run, along, count = stretch.run, stretch.along, len(stretch.run) - 1
@@ -96,11 +101,11 @@ def places_along(
             raise ValueError(
                 f"{pair} get the same position: some sides of the outline are too short compared with the others"
             )
-        place[run[:-1]] = (stretch.begin + stretch.gap * way[:-1]) % 1.0
+        parameters[run[:-1]] = (stretch.begin + stretch.gap * way[:-1]) % 1.0
         # Assign corners without rounding, so that they are met exactly.
-        place[run[chosen]] = t[here]
-        place[run[0]] = stretch.begin
-    return place
+        parameters[run[chosen]] = t[here]
+        parameters[run[0]] = stretch.begin
+    return parameters
 
 
 @dataclass(frozen=True)
@@ -120,7 +125,7 @@ class BoundaryStretch:
         return some[order], local[order]
 
 
-def stretches(s: FloatArray, pins: Held) -> Iterator[BoundaryStretch]:
+def stretches(s: FloatArray, pins: LoopPins) -> Iterator[BoundaryStretch]:
     """Split a loop at its pins."""
     n = len(s)
     for (first, begin), (last, end) in zip(pins, [*pins[1:], pins[0]], strict=True):
@@ -153,11 +158,11 @@ def arc_parameters(points: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], ends[:-1] / ends[-1]])
 
 
-def points_at(contour: FloatArray, place: FloatArray) -> FloatArray:
+def points_at(contour: FloatArray, parameters: FloatArray) -> FloatArray:
     """Points of a contour at parameters from 0 to 1; (n, 2)."""
     t = np.append(arc_parameters(contour), 1.0)
     closed = np.concatenate([contour, contour[:1]])
-    return np.stack([np.interp(place, t, closed[:, axis]) for axis in range(2)], axis=1)
+    return np.stack([np.interp(parameters, t, closed[:, axis]) for axis in range(2)], axis=1)
 
 
 def max_deviation(contour: FloatArray, along: FloatArray, positions: FloatArray) -> float:
@@ -178,8 +183,8 @@ def _match(along: FloatArray, wanted: FloatArray) -> IntArray:
     parameter j takes that vertex.
     """
     cost = np.empty((wanted.size, along.size))
-    for j, place in enumerate(wanted):
-        cost[j] = (along - place) ** 2
+    for j, parameter in enumerate(wanted):
+        cost[j] = (along - parameter) ** 2
         if j:
             cost[j, 1:] += np.minimum.accumulate(cost[j - 1])[:-1]
         # The parameters before need at least j vertices.

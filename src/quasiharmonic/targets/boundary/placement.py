@@ -19,11 +19,11 @@ from quasiharmonic.geometry.mesh.topology import edges, trace_loops
 from quasiharmonic.io.adapters.objects import mesh_triangles
 from quasiharmonic.targets.boundary.correspondence import (
     BoundaryStretch,
-    Held,
+    LoopPins,
     arc_parameters,
+    find_parameters,
     find_start,
     max_deviation,
-    places_along,
     points_at,
     stretches,
 )
@@ -52,7 +52,7 @@ STRAIGHT = 1e-9
 
 
 def clear_chords(
-    s: FloatArray, contour: FloatArray, pins: Held, *, corner_angle: float, chords: IntArray
+    s: FloatArray, contour: FloatArray, pins: LoopPins, *, corner_angle: float, chords: IntArray
 ) -> list[tuple[int, float]] | None:
     """Choose vertices for the convex corners of a contour, near them along the loop, so that chords have space.
 
@@ -179,7 +179,7 @@ class CornerPlacement:
 
     def place(self, start: int = 0) -> tuple[FloatArray, bool]:
         """Return positions and whether chords have space; without pins, ``start`` goes to the contour's first point."""
-        pins: Held = self.pins or [(start, 0.0)]
+        pins: LoopPins = self.pins or [(start, 0.0)]
         along = self._along(pins)
         positions = points_at(self.contour, along)
         if self._fits(positions):
@@ -195,8 +195,8 @@ class CornerPlacement:
         near = max_deviation(self.contour, moved, other) <= allowed
         return (other, True) if near and self._fits(other) else (positions, False)
 
-    def _along(self, pins: Held) -> FloatArray:
-        return places_along(self.s, self.contour, pins, corner_angle=self.corner_angle, names=self.names)
+    def _along(self, pins: LoopPins) -> FloatArray:
+        return find_parameters(self.s, self.contour, pins, corner_angle=self.corner_angle, names=self.names)
 
     def _fits(self, positions: FloatArray) -> bool:
         """Whether chords have space and the positions bound a region."""

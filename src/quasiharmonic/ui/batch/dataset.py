@@ -1,4 +1,9 @@
-"""A data set during a run: its readers hand over problems, and its writers keep their results."""
+"""A data set during a run: its readers hand over problems, and its writers keep their results.
+
+A problem is *known* once its reader has named it, *pending* from when it is handed over until its results are kept, and
+*ready* when it is finished but not yet reported. A stream is *open* from its first problem until the results of all its
+problems are kept.
+"""
 
 from __future__ import annotations
 
@@ -51,10 +56,12 @@ class DataSet:
         self.orders = orders
         self._streams, self._scratch, self._count = streams, scratch, count
         self._lock = threading.RLock()  # `problems` runs in other threads than the other methods
-        self._pending: dict[str, tuple[Stream, ProblemFiles]] = {}
-        self._opened: list[Stream] = []
-        self._ready: list[Finished] = []
-        self._known = self._in_read = self._read = 0
+        self._pending: dict[str, tuple[Stream, ProblemFiles]] = {}  # Pending problems by name
+        self._open: list[Stream] = []  # Streams whose writers are not complete
+        self._ready: list[Finished] = []  # Reports that `collect` has not returned yet
+        self._known = 0  # Number of problems so far
+        self._read_streams = 0  # Number of streams that are read to their end
+        self._known_in_read = 0  # Number of problems of these streams
 
     @property
     def total(self) -> int:
@@ -62,8 +69,9 @@ class DataSet:
         with self._lock:
             if self._count is not None:
                 return self._count
-            unread = len(self._streams) - self._read
-            return max(self._known, self._in_read + round(unread * self._in_read / max(self._read, 1)))
+            unread = len(self._streams) - self._read_streams
+            expected = unread * self._known_in_read / max(self._read_streams, 1)
+            return max(self._known, self._known_in_read + round(expected))
 
     def problems(self) -> Iterator[ProblemFiles]:
         """Yield the problems to solve; those of archives are unpacked when they are asked for."""
@@ -79,8 +87,8 @@ class DataSet:
                     self._known += 1
             with self._lock:
                 stream.read = True
-                self._read += 1
-                self._in_read = self._known
+                self._read_streams += 1
+                self._known_in_read = self._known
 
     def collect(self, item: Finished | None) -> list[Finished]:
         """Keep the results of an item of the pool, if there is one, and complete archives; return what is finished."""
@@ -88,8 +96,8 @@ class DataSet:
             if item is not None:
                 self._keep(item.name)
                 self._ready.append(item)
-            for stream in [one for one in self._opened if one.read and not one.waiting]:
-                self._opened.remove(stream)
+            for stream in [one for one in self._open if one.read and not one.waiting]:
+                self._open.remove(stream)
                 stream.writer.finish()
             ready, self._ready = self._ready, []
             return ready
@@ -115,7 +123,7 @@ class DataSet:
                 self._known += found.total()
                 return
             stream.writer.open()
-            self._opened.append(stream)
+            self._open.append(stream)
         for files in stream.reader.problems(self.orders, self._scratch):
             with self._lock:
                 self._known += 1

@@ -19,8 +19,8 @@ from quasiharmonic.ui.batch.supervisor import ClosedError, Finished, Supervisor
 _STEADY = 20
 # Seconds between two values None while nothing is finished.
 _POLL_INTERVAL = 0.2
-# Number of problems waiting to be solved alone from which this is done before the end.
-_MANY = 16
+# From this number of problems that wait to be solved alone, they are solved before the end of the data set.
+_MANY_STARVED = 16
 
 
 class Slots:
@@ -35,17 +35,19 @@ class Slots:
     ----------
     limit : int
         Present limit, from 1 to ``count``.
+    reserved : bool
+        Whether a block of `alone` runs or waits. No slot is free then.
     """
 
     def __init__(self, count: int) -> None:
         self.limit = count
         self._count = count
-        self._busy = 0
         self.reserved = False
-        self._steady = 0
+        self._busy = 0  # Number of occupied slots
+        self._steady = 0  # Successes since the limit changed, or a process lacked memory
         self._closed = False
-        self._changed = threading.Condition()
-        self._one_alone = threading.Lock()
+        self._changed = threading.Condition()  # guards the above, and signals that a slot may be free
+        self._one_alone = threading.Lock()  # held by the only block of `alone` that runs
 
     @contextmanager
     def one(self, rest: Callable[[], object]) -> Iterator[None]:
@@ -152,7 +154,7 @@ class _WorkerPool:
         try:
             while (group := self._next()) is not None:
                 self._solve(supervisor, group)
-                if len(self._starved) >= _MANY:
+                if len(self._starved) >= _MANY_STARVED:
                     self._solve_alone(supervisor)
             supervisor.rest()
             self._solve_alone(supervisor)

@@ -20,7 +20,8 @@ from quasiharmonic.ui.batch.shards import Shard
 
 # Numbered archives in the notation of WebDataset: data-{0000..0015}.tar.
 _NUMBERS = re.compile(r"\{([0-9]+)\.\.([0-9]+)\}")
-_MANY = 10_000_000
+# Maximum number of archives that such a name stands for.
+_MAX_NUMBERS = 10_000_000
 # What messages call the folder of unpacked problems.
 _SCRATCH = "to the folder for temporary files"
 
@@ -159,7 +160,7 @@ def _expand(location: str) -> list[str]:
     if match is None:
         return [location]
     first, last = int(match[1]), int(match[2])
-    if not first <= last < first + _MANY:
+    if not first <= last < first + _MAX_NUMBERS:
         raise ValueError(f"{match[0]}: the first number must not be greater than the second")
     width = len(match[1]) if match[1].startswith("0") else 0
     start, end = location[: match.start()], location[match.end() :]

@@ -1,10 +1,15 @@
-"""Bitmaps of all charts, placed on boards of variable size."""
+"""Bitmaps of all charts, placed one after another on boards of variable size, largest charts first.
+
+Bitmaps are drawn once, with cells of a fixed size in units of length. A board with fewer cells stands for a tile at a
+larger scale. So the search for the largest scale is a search for the smallest board on which all bitmaps fit.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,23 +18,48 @@ from quasiharmonic.apps.atlas.packing.shapes import Shape
 from quasiharmonic.util.arrays import ComplexArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
-# Cells along a tile for at most so many charts, and on the finer board for the final layout. More charts get
-# proportionally smaller cells, up to a limit.
-_CELLS, _FINE_CELLS, _FEW = 128, 384, 36
-_CELLS_OF_MANY, _FEW_OF_MANY, MOST_CELLS = 128, 20, 2048
-# Directions of each chart: sixteen for at most so many charts, then eight. More than the second number get four, and
-# their boards are searched window by window.
-_MOST_DIRECTIONS, MANY = 20, 50
-# Range of the scale on the finer board, relative to that on the coarser one.
-_FINE_GAIN, _FINE_LOSS = 1.06, 1.01
+#: More charts than this have four directions each, and are placed once; their boards are searched window by window.
+MANY = 50
 #: Charts beyond this number are placed as boxes, the smallest ones.
 BITMAPS = 500
-# The number of cells along a tile varies between these multiples of the expected number.
-_FEWEST_CELLS, MORE_CELLS = 0.8, 1.25
 #: Placements tried with other orders of the charts, in all.
 TRIALS = 120
-# Relative precision of the scale of few charts, at first, and of many.
-_MEDIUM, _COARSE = 0.03, 0.04
+#: Largest number of cells along a tile.
+MOST_CELLS = 2048
+#: The number of cells along a tile is at most this multiple of the expected number.
+MORE_CELLS = 1.25
+
+
+class BitmapTuning(NamedTuple):
+    """Numbers that tune the boards; charts are few up to `MANY`, and many above."""
+
+    # Expected number of cells along a tile for few charts.
+    cells: int = 128
+    # The same on the finer board, which is for the final layout of few charts.
+    fine_cells: int = 384
+    # Number of few charts on a tile from which cells are proportionally smaller.
+    charts_per_tile: int = 36
+    # Expected number of cells along a tile for many charts.
+    cells_of_many: int = 128
+    # Number of many charts on a tile from which cells are proportionally smaller.
+    many_per_tile: int = 20
+    # The number of cells along a tile is at least this multiple of the expected number.
+    fewest_cells: float = 0.8
+    # Few charts have sixteen directions each up to this number, and eight above.
+    sixteen_directions: int = 20
+    # Relative precision of the first scale of few charts.
+    precision: float = 0.03
+    # Relative precision of the scale of many charts.
+    precision_of_many: float = 0.04
+    # Spread of the logarithm of the areas by which charts are ordered in the trials.
+    spread: float = 0.3
+    # Largest scale on the finer board, relative to that on the coarser one.
+    fine_gain: float = 1.06
+    # Smallest scale on the finer board: the scale on the coarser one divided by this.
+    fine_loss: float = 1.01
+
+
+_TUNING = BitmapTuning()
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +103,8 @@ class BitmapSearch:
     ) -> None:
         self._size, self._tiles, self._padding = size, tiles, padding
         few = len(shapes) <= MANY
-        cells = finer * ((_CELLS if given is None else _FINE_CELLS) if few else _CELLS_OF_MANY)
-        number = _FEW if few else _FEW_OF_MANY
+        cells = finer * ((_TUNING.cells if given is None else _TUNING.fine_cells) if few else _TUNING.cells_of_many)
+        number = _TUNING.charts_per_tile if few else _TUNING.many_per_tile
         self.cells = ceil(min(cells * max(1.0, sqrt(len(shapes) / tiles / number)), MOST_CELLS))
         # Length of a cell's side.
         self._cell = max(size) / self.cells / scale
@@ -84,9 +114,10 @@ class BitmapSearch:
         self.areas = np.array([shape.area for shape in shapes])
         # Shapes of equal area stay in their order, whatever the rounding.
         self._order = np.argsort(-np.round(self.areas / (self.areas.max() or 1.0), 9), kind="stable")
-        self._few = bitmaps
+        self._drawn = bitmaps
         large, small = self._order[:bitmaps], self._order[bitmaps:]
-        turns = np.exp(0.125j * pi * (np.arange(4) if len(shapes) <= _MOST_DIRECTIONS else np.arange(0, 4, 2)))
+        step = 1 if len(shapes) <= _TUNING.sixteen_directions else 2
+        turns = np.exp(0.125j * pi * np.arange(0, 4, step))
         turns = turns if few and skewed else turns[:1]
         self._bitmaps: dict[int, Bitmaps] = {}
         self._halves: dict[tuple[int, int], Bitmaps] = {}
@@ -126,16 +157,15 @@ class BitmapSearch:
 
         Return the layout on it, and the order of the shapes.
         """
-        # Spread of the logarithm of the areas by which charts are ordered in these trials.
-        spread = 0.3
-        best, high = self._scan(least, _MEDIUM)
+        best, high = self._scan(least, _TUNING.precision)
         if best is None:
             return None
         while (found := self.place_in(high - 1)) is not None:
             best, high = found, high - 1
         generator, best_order = np.random.default_rng(0), self._order
         for _ in range(trials // len(self.areas)):
-            order = np.argsort(-self.areas * np.exp(generator.normal(0, spread, len(self.areas))), kind="stable")
+            factors = np.exp(generator.normal(0, _TUNING.spread, len(self.areas)))
+            order = np.argsort(-self.areas * factors, kind="stable")
             parts = generator.integers(0, 3, len(self.areas))
             while (found := self.place_in(high - 1, order, parts)) is not None:
                 high, best, best_order = high - 1, found, order
@@ -144,7 +174,7 @@ class BitmapSearch:
     def enlarge_finely(self, order: IntArray) -> Layout | None:
         """Find a small board for bitmaps in a given order that fit at about the expected scale."""
         best = None
-        low, high = int(self.cells / _FINE_GAIN), ceil(self.cells * _FINE_LOSS)
+        low, high = int(self.cells / _TUNING.fine_gain), ceil(self.cells * _TUNING.fine_loss)
         while high - low > 1:
             middle = (low + high) // 2
             found = self.place_in(middle, order)
@@ -153,14 +183,14 @@ class BitmapSearch:
 
     def enlarge_coarsely(self, least: float) -> Layout | None:
         """Find a small board for many bitmaps."""
-        return self._scan(least, _COARSE)[0]
+        return self._scan(least, _TUNING.precision_of_many)[0]
 
     def _scan(self, least: float, precision: float) -> tuple[Layout | None, int]:
         """Find a small board on which the bitmaps fit; return the layout and the number of cells.
 
         On a larger board, they may not fit: the first ones then lie elsewhere. So all sizes are tried, smallest first.
         """
-        cells = int(_FEWEST_CELLS * self.cells)
+        cells = int(_TUNING.fewest_cells * self.cells)
         last = int(min(MORE_CELLS * self.cells, max(self._size) / (self._cell * least)))
         while (best := self.place_in(cells)) is None and cells < last:
             cells = min(cells + max(1, int(precision * cells)), last)
@@ -197,7 +227,7 @@ class BitmapSearch:
         n = len(self.areas)
         directions, centres, tiles = np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64)
         placed: tuple[int, ...] = (cells,)
-        for i in (self._order[: self._few] if order is None else order).tolist():
+        for i in (self._order[: self._drawn] if order is None else order).tolist():
             heartbeat()
             part = 0 if parts is None else int(parts[i])
             bitmaps = self._select(i, part)
@@ -215,7 +245,7 @@ class BitmapSearch:
             boards[tile].put(bitmap, spot.row, spot.column)
             directions[i], tiles[i] = bitmaps.directions[spot.direction], tile
             centres[i] = complex(spot.column + bitmap.shape[1] / 2, spot.row + bitmap.shape[0] / 2) * texels
-        rest = self._order[self._few :]
+        rest = self._order[self._drawn :]
         directions[rest] = self._lying
         boxes = np.ceil(self._boxes + self._padding / texels).astype(np.int64)
         waiting = np.arange(len(rest))

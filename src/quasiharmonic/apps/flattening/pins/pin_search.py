@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,23 +49,34 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.options import FlattenOptions
 
-# Tolerance for the map that is then moved onto the pins.
-_TOLERANCE = 1e-2
-# Maximum number of steps for that map.
-_MAX_STEPS = 40
-# Distance of the frame, relative to the longer side of the box around surface and pins, for each attempt in turn.
-_MARGINS = 0.5, 1.5
-# Iterations on tensors before vertices are moved. In hard cases this takes a third of the time of waiting until
-# tensors converge, and is as reliable, since the other methods follow.
-_TENSOR_ITERATIONS = 60
-# Iterations on vertices.
-_VERTEX_ITERATIONS = 300
-# Maximum number of consecutive failed restarts of patches, after all other methods have failed.
-_IN_VAIN = 30
-# Minimum of the limit on linear solves per attempt.
-_MIN_ITERATIONS = 2000
-# Maximum number of times that air edges are split.
-_MAX_SPLITS = 4
+
+class PinTuning(NamedTuple):
+    """Numbers that tune the search for a map with fixed vertices."""
+
+    # Tolerance for the map without pins, which is then moved onto them.
+    tol: float = 1e-2
+    # Maximum number of steps for that map.
+    max_steps: int = 40
+    # Distance of the frame, relative to the longer side of the box around surface and pins, for each attempt in turn.
+    margins: tuple[float, ...] = (0.5, 1.5)
+    # Iterations on tensors before vertices are moved. In hard cases this takes a third of the time of waiting until
+    # tensors converge, and is as reliable, since the other methods follow.
+    tensor_iterations: int = 60
+    # Iterations on vertices.
+    vertex_iterations: int = 300
+    # Maximum number of consecutive failed restarts of patches, after all other methods have failed.
+    max_failures: int = 30
+    # Minimum of the limit on linear solves per attempt.
+    min_iterations: int = 2000
+    # Maximum number of times that air edges are split.
+    max_splits: int = 4
+    # Binary exponent: maximum ratio between the extent of the pins and the surface's size, either way, for energies.
+    max_ratio_exponent: int = 100
+    # Binary exponent: maximum distance of a map from the origin, in its unit.
+    max_distance_exponent: int = 1000
+
+
+_TUNING = PinTuning()
 
 
 def move_onto_pins(uv: FloatArray, fixed: IntArray, target: FloatArray) -> FloatArray:
@@ -90,9 +102,9 @@ def _choose_stages(problem: Problem, *, last: bool) -> Stages:
     stages = [stage for stage in speed(problem) if not isinstance(stage, RandomRestarts)]
     if isinstance(stages[0], CoarseToFine):
         return stages
-    first = VectorAdam(parameterisation="si-log", iterations=_TENSOR_ITERATIONS)
-    restarts = [RandomRestarts(max_failures=_IN_VAIN)] if last else []
-    return [first, Untangling(iterations=_VERTEX_ITERATIONS, resume=True), *stages, *restarts]
+    first = VectorAdam(parameterisation="si-log", iterations=_TUNING.tensor_iterations)
+    restarts = [RandomRestarts(max_failures=_TUNING.max_failures)] if last else []
+    return [first, Untangling(iterations=_TUNING.vertex_iterations, resume=True), *stages, *restarts]
 
 
 def check_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, FloatArray]:
@@ -106,10 +118,6 @@ def check_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, F
     return vertices, target_positions(target, vertices.size)
 
 
-# Binary exponent: maximum ratio between the extent of the pins and the surface's size, either way, for energies.
-_APART = 100
-# Binary exponent: maximum distance of a map from the origin, in its unit.
-_LARGEST = 1000
 # Statuses that only report that no map was found; the map may still be injective.
 _UNDECIDED = Status.INJECTIVE, Status.STALLED, Status.OUT_OF_ITERATIONS, Status.UNSOLVABLE
 
@@ -144,9 +152,9 @@ class PinSearch:
         # Computed from quarters, because the difference of the largest doubles overflows.
         extent, quarter = np.frexp(np.ptp(np.ldexp(target, -2), axis=0).max())
         apart = int(quarter) + 2 - piece.exponent if extent > 0 else 0
-        unit = piece.exponent + apart - min(max(apart, -_APART), _APART)
+        unit = piece.exponent + apart - min(max(apart, -_TUNING.max_ratio_exponent), _TUNING.max_ratio_exponent)
         # Pins may be even farther from the origin, and the map there must also stay within the range of doubles.
-        self._larger = max(find_exponent(target) - _LARGEST - unit, 0)
+        self._larger = max(find_exponent(target) - _TUNING.max_distance_exponent - unit, 0)
         self.exponent = unit + self._larger
         self._target = np.ldexp(target, -self.exponent)
         self._energy = piece.energy(find_energy(options.energy), weights)
@@ -177,7 +185,7 @@ class PinSearch:
         """Flatten freely, optionally from a start in the surface's unit, and move the map onto the pins; (n, 2)."""
         piece = self._piece
         solver = self._options.linear_solver
-        rough = FlattenOptions(tol=_TOLERANCE, max_iterations=_MAX_STEPS, linear_solver=solver)
+        rough = FlattenOptions(tol=_TUNING.tol, max_iterations=_TUNING.max_steps, linear_solver=solver)
         flat = Flattening(piece, rough, None).run(None if start is None else np.ldexp(start, -piece.exponent))
         self._run.stages += flat.stages
         self._solver = flat.linear_solver
@@ -199,8 +207,8 @@ class PinSearch:
             # At this distance or scale, doubles cannot resolve the triangles.
             self.status = Status.ROUNDED
             return
-        for margin in _MARGINS:
-            self._search(moved, margin, last=margin == _MARGINS[-1])
+        for margin in _TUNING.margins:
+            self._search(moved, margin, last=margin == _TUNING.margins[-1])
             if self.certificate.bijective or self.status in (Status.INTERRUPTED, Status.IMPOSSIBLE):
                 return
 
@@ -218,7 +226,7 @@ class PinSearch:
         target = np.concatenate([self._target, air.points[air.frame - n]])
         inner = edges(F, len(points)).interior
         split = self._select_air_edges(inner[np.isin(inner, fixed).all(axis=1)])
-        for _ in range(1 + _MAX_SPLITS):
+        for _ in range(1 + _TUNING.max_splits):
             refined = split_edges(points, F, split)
             F, points = refined.F, refined.V
             problem = Problem(points, F, fixed, target, reference="equilateral")
@@ -226,7 +234,7 @@ class PinSearch:
             found = solve(
                 problem,
                 strategy=_choose_stages(problem, last=last),
-                max_iterations=max(_MIN_ITERATIONS, options.max_iterations),
+                max_iterations=max(_TUNING.min_iterations, options.max_iterations),
                 linear_solver=options.linear_solver,
                 callback=options.callback,
             )
