@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from quasiharmonic import certify
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import certify_each
-from quasiharmonic.geometry.exact.loops import contacts, doubtful_pairs, join_items, simple_loops
+from quasiharmonic.geometry.exact.loops import LoopEdges, check_loops, contacts, doubtful_pairs, join_items, simple_loops
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.exact.triangles import sure_signs, triangle_signs
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
@@ -252,3 +252,20 @@ def test_certificates_of_many_maps_have_the_given_arrays(monkeypatch):
     assert bijective == {"one triangle", "a strip", "another strip", "square", "a ring"}
     # The bijective maps with one loop are certified together.
     assert len(single) == len(maps) - 4
+
+
+def test_many_loops_are_compared_wherever_they_are():
+    rng = np.random.default_rng(3)
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    uv = np.concatenate([square + rng.uniform(0, 60, 2) for _ in range(300)])
+    loops = list(np.arange(len(uv)).reshape(-1, 4))
+    centers = uv[::4]
+    apart = np.abs(centers[:, None] - centers[None]).max(axis=2)
+    expected = {(i, j) for i, j in np.argwhere(apart < 1).tolist() if i < j}
+    assert expected
+    crossings, reasons = check_loops(loops, uv)
+    assert {tuple(sorted((a // 4, c // 4))) for a, _, c, _ in crossings.tolist()} == expected
+    assert {reason.loops for reason in reasons} == expected
+    order = LoopEdges.of(loops, uv).order_by_place()
+    assert np.array_equal(np.sort(order), np.arange(len(uv)))
+    assert np.array_equal(order.reshape(-1, 4) % 4, np.tile(np.arange(4), (300, 1)))

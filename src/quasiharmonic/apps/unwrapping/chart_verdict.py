@@ -12,7 +12,7 @@ from quasiharmonic.apps.unwrapping.layout import ChartLayout
 from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import Certificate
-from quasiharmonic.geometry.exact.loops import Obstacle
+from quasiharmonic.geometry.exact.loops import LoopEdges, Obstacle
 from quasiharmonic.geometry.exact.predicates import box_pairs
 from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of, repeat_each
@@ -188,8 +188,9 @@ def measure_clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vert
     """Return the smallest distance between boundaries of different charts; infinity if it exceeds ``reach``."""
     if len(loops) < 2:
         return np.inf
-    tail, head = np.concatenate(loops), np.concatenate([np.roll(loop, -1) for loop in loops])
-    p, q, owner = uv[tail], uv[head], chart_of_vertex[tail]
+    curves = LoopEdges.of(list(loops), uv)
+    order = curves.order_by_place()
+    p, q, owner = curves.p[order], curves.q[order], chart_of_vertex[curves.ends[order, 0]]
     least = np.inf
     for i, j in box_pairs(np.minimum(p, q) - reach / 2, np.maximum(p, q) + reach / 2):
         apart = owner[i] != owner[j]

@@ -53,10 +53,10 @@ from quasiharmonic.util.progress import reports_progress
 
 # Positions beyond this power of two, or all below its reciprocal, are scaled.
 _MAX_EXPONENT = 300
-# After a time limit, charts are completed, packed and certified in about the time that the preparation takes.
-_RESERVED = 1.0
+# After a time limit, charts are completed, packed and certified in about this multiple of the time of the preparation.
+_RESERVED = 2.0
 # Then so many charts are packed by their shapes, and further ones as boxes.
-_PACKED_CLOSELY = 100
+_PACKED_CLOSELY = 30
 
 
 class UnwrapKeywords(TypedDict, total=False):

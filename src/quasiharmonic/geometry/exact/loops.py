@@ -19,11 +19,21 @@ from quasiharmonic.geometry.exact.predicates import (
     segment_relation,
     sure_orientation,
 )
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, repeat_each
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    SignArray,
+    enumerate_each,
+    morton_order,
+    repeat_each,
+)
 from quasiharmonic.util.kernels import compiled
 
 # Maximum number of pairs of boundary edges to list. A collapsed boundary has billions.
 _MAX_CROSSINGS = 1000
+# Up to this number, loops are not sorted by their places.
+_FEW_LOOPS = 16
 # Number of pairs of an edge and a point at the same height that are processed together.
 PAIR_CHUNK = 1 << 18
 
@@ -259,6 +269,14 @@ class LoopEdges:
         head, owner = tail[following], repeat_each(np.arange(len(loops)), np.diff(start))
         return cls(start, owner, np.stack([tail, head], 1), uv[tail], uv[head], following)
 
+    def order_by_place(self) -> IntArray:
+        """Return the edges (k,), loop by loop, so that consecutive loops are close to each other if there are many."""
+        if len(self.start) <= _FEW_LOOPS:
+            return np.arange(len(self.ends))
+        loops = morton_order(self.p[self.start[:-1]])
+        which, edge = enumerate_each(np.diff(self.start)[loops])
+        return self.start[loops][which] + edge
+
 
 def _concatenate_loops(loops: list[IntArray]) -> tuple[IntArray, IntArray, IntArray]:
     """Return the concatenated loops (k,), their offsets (l + 1,), and the index of each vertex's successor (k,)."""
@@ -294,7 +312,10 @@ def _find_meeting_edges(curves: LoopEdges, uv: FloatArray) -> IntArray:
     # An edge of zero length lies entirely on the edges before and after it.
     point = (curves.p == curves.q).all(axis=1)
     on_zero_edges = np.sort(consecutive[point[consecutive].any(axis=1)], axis=1)
-    pairs = np.concatenate([on_zero_edges, contacts(uv, curves.ends, _MAX_CROSSINGS).pairs])
+    # Trees of boxes are tight only if consecutive loops are close to each other.
+    order = curves.order_by_place()
+    found = np.sort(order[contacts(uv, curves.ends[order], _MAX_CROSSINGS).pairs], axis=1)
+    pairs = np.concatenate([on_zero_edges, found])
     return np.unique(pairs, axis=0)[:_MAX_CROSSINGS] if len(pairs) else pairs
 
 
