@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 from quasiharmonic import certify
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import certify_each
-from quasiharmonic.geometry.exact.loops import LoopEdges, check_loops, contacts, doubtful_pairs, join_items, simple_loops
+from quasiharmonic.geometry.exact.loops import (
+    LoopEdges,
+    check_loops,
+    contacts,
+    doubtful_pairs,
+    join_items,
+    simple_loops,
+)
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.exact.triangles import sure_signs, triangle_signs
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components

@@ -11,7 +11,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS
+from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY
 from quasiharmonic.apps.atlas.packing.pack import check_texture
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
@@ -56,7 +56,7 @@ _MAX_EXPONENT = 300
 # After a time limit, charts are completed, packed and certified in about this multiple of the time of the preparation.
 _RESERVED = 2.0
 # Then so many charts are packed by their shapes, and further ones as boxes.
-_PACKED_CLOSELY = 30
+_PACKED_CLOSELY = MANY
 
 
 class UnwrapKeywords(TypedDict, total=False):
