@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 
 import campaign
-import compare_options
 import phases
 import problems
-import sculptures
-import sequences
 import small_problems
 import speed
 import stages
 import tetrahedral_problems
 from quasiharmonic import Problem, boundary_loops, certify, certify_tetrahedra, injective_tetrahedra, solve
-from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.search.stages import stages_of
 
 pytestmark = pytest.mark.long
@@ -315,30 +311,3 @@ def test_label_and_contribution_of_a_stage():
     assert stages.kind(outcomes[0].result.stages[0]) == "vector-adam, si-log"
     first = stages.stages("paper", outcomes).splitlines()[2]
     assert first.startswith("| vector-adam, si-log | 2 |")
-
-
-@pytest.mark.parametrize("name", sequences.SCENES)
-def test_scenes_of_sequences_have_a_simple_target_in_every_frame(name):
-    V, F, fixed, targets = sequences.SCENES[name](4)
-    assert targets.shape == (4, len(fixed), 2)
-    problem = Problem(V, F, fixed, targets[0])
-    assert all(solve(problem.with_target(target)).certificate.bijective for target in targets)
-
-
-def test_motion_is_relative_to_the_boundary():
-    uv = np.zeros((3, 4, 2))
-    uv[1:, 0, 0] = 3.0
-    targets = np.zeros((3, 2, 2))
-    targets[1:, 1, 1] = 1.5
-    np.testing.assert_array_equal(sequences.moves(uv, targets), [2.0, np.nan])
-
-
-def test_a_row_of_compared_searches():
-    """The first row is the unit of time; a search without an injective map has no distortion."""
-    (problem,) = sculptures.seven(16, 1).values()
-    choices = {("good",): "speed", ("none",): VectorAdam(iterations=1)}
-    heads, good, none = compare_options.compared([problem], ("search",), choices)
-    assert heads == ["search", *compare_options.RESULTS]
-    assert (good[:2], good[3]) == (["good", "1 of 1"], "1.0")
-    assert float(good[4]) > 0
-    assert (none[1], none[4]) == ("0 of 1", "")
