@@ -218,7 +218,6 @@ class TestNoMap:
             "CoarseToFine",
             "Composite",
             "LineShift",
-            "LocalRepair",
         ]
 
     def test_wide_patches_precede_the_whole_of_a_large_mesh(self):

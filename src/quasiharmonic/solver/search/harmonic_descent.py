@@ -10,6 +10,8 @@ implementation all three terms are dimensionless, η has the same meaning, and n
 
 R₁ is a *regulariser*, a function of the tensor field that is added to an injectivity functional (§11.1.4).
 
+::
+
     map ──▶ ξ of its own tensors ──▶ VectorAdam, a few steps ──▶ L-BFGS in units learnt from it ──▶ map
      ▲                                                                                              │
      └───────────────────────────────── next round with the next η ─────────────────────────────────┤

@@ -17,7 +17,7 @@ from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.problem.result import MapResult, Stage, Status
 from quasiharmonic.problem.run import finish
-from quasiharmonic.solver.methods import Descent, LineShift, LocalRepair, Newton, Untangling, VectorAdam
+from quasiharmonic.solver.methods import Descent, LineShift, Newton, Untangling, VectorAdam
 from quasiharmonic.solver.methods.base import SearchState
 from quasiharmonic.solver.methods.local_repair import MAX_INVERTED
 from quasiharmonic.solver.search.coarse import coarse_mesh
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 # vertices share a target position, V₃ is almost zero at folded maps, too, and repairs hardly ever help.
 _FAILED_REPAIRS, _FAILED_REPAIRS_OF_TOUCHING = 16, 2
 # Stages that untangle the last few triangles.
-LOCAL_REPAIRS = LineShift(resume=True), LocalRepair(tries=15, resume=True)
+LOCAL_REPAIRS = (LineShift(resume=True),)
 # Stages that follow the first stage on a coarse mesh.
 _COARSE_STAGES = *LOCAL_REPAIRS, Untangling(resume=True), *LOCAL_REPAIRS
 

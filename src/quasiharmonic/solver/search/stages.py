@@ -18,7 +18,6 @@ from quasiharmonic.solver.methods import (
     Composite,
     Descent,
     LineShift,
-    LocalRepair,
     Newton,
     RandomRestarts,
     Untangling,
@@ -73,7 +72,7 @@ class _DescentStage(SearchStage):
 class CoarseToFine(_DescentStage):
     """Stage that searches on a coarse mesh and transfers the map to the fine mesh; skipped if the mesh is small.
 
-    ``descent`` is the first stage on the coarse mesh; local repair and untangling follow.
+    ``descent`` is the first stage on the coarse mesh; line shift and untangling follow.
     """
 
     coarse: ClassVar[bool] = True
@@ -99,7 +98,7 @@ class TentativeStage(_DescentStage):
 
 
 class IfManyInverted(_DescentStage):
-    """Stage that runs only if so many triangles are inverted that local repair would be slower."""
+    """Stage that runs only if so many triangles are inverted that line shifts would be slower."""
 
     def run(self, search: StageRunner) -> None:
         """See `SearchStage`."""
@@ -140,18 +139,17 @@ def _speed(pinned: bool, is_disk: bool, composed: bool, large: bool, wide: bool)
         newton = Newton(parameterisation="si-log", iterations=60, resume=True)
     else:
         first, newton = VectorAdam(iterations=100, relocation=True), Newton(iterations=300, resume=True)
-    # Most successful local repairs succeed within the first tries, and a failed try costs as much as many Newton steps.
-    repair: Stages = (LineShift(resume=True), LocalRepair(tries=15, resume=True))
+    shift = LineShift(resume=True)
     if is_disk:
         # Two different starts: if one fails, the other may succeed.
         composite = Composite(iterations=100, relocation=True)
         first, second = (composite, first) if composed else (first, composite)
-        other = (second, *repair)
+        other = (second, shift)
     coarse = CoarseToFine(first)
-    first_stages: Stages = (first, *repair, coarse)
+    first_stages: Stages = (first, shift, coarse)
     if large:
-        # Newton steps untangle thousands of triangles at once, local repair only one patch at a time.
-        first_stages = (coarse, first, *((IfManyInverted(newton),) if is_disk else ()), *repair)
+        # Newton steps untangle thousands of triangles at once, line shifts only a few.
+        first_stages = (coarse, first, *((IfManyInverted(newton),) if is_disk else ()), shift)
     return (
         *first_stages,
         *((WideRepair(resume=True),) if wide else ()),
