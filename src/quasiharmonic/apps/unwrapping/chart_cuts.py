@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import KEPT_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.mesh.fans import fans, renumber
-from quasiharmonic.geometry.mesh.topology import label_components, pair_sides
+from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
@@ -216,7 +216,7 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     # Groups in the band are nodes; all others are the source, k, or the sink, k + 1.
     node = np.where(source, k, np.where(sink, k + 1, group))
     numbers, node = np.unique(np.concatenate([node, [k, k + 1]]), return_inverse=True)
-    first, second, edge = _pairs(graph)
+    first, second, edge = graph.list_pairs()
     most = _TUNING.max_cost / (len(edge) + 1)
     capacity = np.clip(graph.cost[edge] / np.mean(graph.cost) * _TUNING.cost_unit, 1, most).astype(np.int32)
     a, b = node[first], node[second]
@@ -247,7 +247,7 @@ def _group_undivided(cost: FloatArray, graph: EdgeGraph, least: float = UNDIVIDE
     dear_sides = cost >= least
     if not dear_sides.any():
         return np.arange(len(cost))
-    first, second, edge = _pairs(graph)
+    first, second, edge = graph.list_pairs()
     dear = mark(len(graph.ends), graph.side.T[dear_sides])
     joined = dear[edge]
     return label_components(first[joined], second[joined], len(cost))
@@ -258,12 +258,6 @@ def _mean_of_groups(values: FloatArray, group: IntArray) -> FloatArray:
     size = np.bincount(group, minlength=len(values))
     total = np.bincount(group, values, minlength=len(values))
     return total[group] / size[group]
-
-
-def _pairs(graph: EdgeGraph) -> tuple[IntArray, IntArray, IntArray]:
-    """The two triangles (e,) at each interior edge, and the edges (e,)."""
-    one, other = pair_sides(graph.side.T)
-    return one // 3, other // 3, graph.side.T.ravel()[one]
 
 
 def _open(chart: WorkingChart, cut: BoolArray) -> list[WorkingChart]:

@@ -127,7 +127,8 @@ def _fit(
     F, n = chart.F, len(w)
     corners = np.ascontiguousarray(F.T)
     unfolding = _Unfolding(F, g)
-    turned = unfolding.carry(w, known)
+    p, q = _derivatives(g, w[corners])
+    turned = unfolding.carry(_direction(p), known[F].all(axis=1) & (np.abs(p) > np.abs(q)))
     if turned is None:
         return None
     area = 1 / np.abs((g[1].conj() * g[2]).imag)
@@ -136,8 +137,7 @@ def _fit(
     most = 1 + _PERMITTED * (bound - 1)
     for k in range(_MOST_FITS + 1):
         workers.check_wanted()
-        at = w[corners]
-        p, q = (g.conj() * at).sum(axis=0), (g * at).sum(axis=0)
+        p, q = _derivatives(g, w[corners])
         larger, smaller = np.abs(p) + np.abs(q), np.abs(p) - np.abs(q)
         with np.errstate(all="ignore"):
             scale = np.sqrt(area.sum() / (area * larger * smaller).sum())
@@ -150,11 +150,10 @@ def _fit(
         larger, smaller = np.clip(larger, 1 / less, less), np.clip(smaller, 1 / less, less)
         if collapsed.any():
             # The boundary would stay folded where the rotations of these triangles are wrong.
-            around = mark_around(F, collapsed, n)
-            carried = unfolding.carry(w, ~around)
+            near = has_marked_corner(F, mark_around(F, collapsed, n))
+            carried = unfolding.carry(rotation, ~near)
             if carried is not None:
-                near = has_marked_corner(F, around)
-                rotation[near] = carried[near]
+                rotation = carried
                 larger[near] = smaller[near] = 1.0
         target = 0.5 * (larger + smaller) * rotation - p, 0.5 * (larger - smaller) * _direction(q) - q
         load = area * (target[0] * g + target[1] * g.conj())
@@ -162,6 +161,11 @@ def _fit(
     if not np.isfinite(w).all() or len(check_loops(chart.piece.loops, to_points(w))[0]):
         return None
     return _repair(chart, to_points(w), smaller <= 0)
+
+
+def _derivatives(g: ComplexArray, at: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Complex derivatives p and q (f,) of a map with positions ``at`` (3, f) of the corners."""
+    return (g.conj() * at).sum(axis=0), (g * at).sum(axis=0)
 
 
 def _direction(p: ComplexArray) -> ComplexArray:
@@ -197,7 +201,6 @@ class _Unfolding:
     """Rotations of triangles (f, 3) as they unfold from their neighbours; ``g`` (3, f) is as in `NewtonSystem`."""
 
     def __init__(self, F: IntArray, g: ComplexArray) -> None:
-        self._F, self._g = F, g
         one, other = find_pairs(F)
         # Side k of a triangle is orthogonal to the gradient at its opposite corner.
         side = np.ascontiguousarray(g[(2, 0, 1), :].T).ravel()
@@ -206,17 +209,14 @@ class _Unfolding:
         self._source, self._there = np.concatenate([one, other]) // 3, np.concatenate([other, one]) // 3
         self._turn = np.concatenate([turn, turn.conj()])
 
-    def carry(self, w: ComplexArray, known: BoolArray) -> ComplexArray | None:
-        """Return the rotation (f,) of each triangle by a map w (n,), carried on to triangles with unknown corners.
+    def carry(self, rotation: ComplexArray, known: BoolArray) -> ComplexArray | None:
+        """Return rotations (f,) with those of known triangles (f,) carried on to the others.
 
-        None if no triangle has known corners.
+        None if no triangle is known.
         """
-        at = w[np.ascontiguousarray(self._F.T)]
-        p, q = (self._g.conj() * at).sum(axis=0), (self._g * at).sum(axis=0)
-        done = known[self._F].all(axis=1) & (np.abs(p) > np.abs(q))
-        if not done.any():
+        if not known.any():
             return None
-        turned = _direction(p)
+        turned, done = rotation.copy(), known.copy()
         left = ~done[self._there]
         source, there, turn = self._source[left], self._there[left], self._turn[left]
         while True:
@@ -224,7 +224,7 @@ class _Unfolding:
             if not reached.any():
                 return turned
             new = there[reached]
-            total = sum_at(new, turned[source[reached]] * turn[reached], len(self._F))
+            total = sum_at(new, turned[source[reached]] * turn[reached], len(done))
             turned[new] = _direction(total[new])
             done[new] = True
             left = ~done[there]

@@ -13,7 +13,7 @@ from quasiharmonic.apps.unwrapping.grown_charts import grow_charts
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
 from quasiharmonic.apps.unwrapping.mirrored_charts import mirror_charts
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
-from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.topology import mark_sides
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -77,6 +77,6 @@ class Draft:
             grown[chart.triangles] = False
         cut = cost <= DEMANDED_COST
         if cuts is not None:
-            cut |= np.isin(edge_keys(F, F[:, (1, 2, 0)], len(V)), pair_keys(cuts, len(V)))
+            cut |= mark_sides(F, cuts, len(V))
         found += grow_charts(V, F, np.flatnonzero(grown), cost, cut, bound)
         return sorted(found, key=lambda chart: int(chart.triangles[0])), grown

@@ -8,7 +8,7 @@ import numpy as np
 
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.geometry.mesh.reference import area_vectors
-from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.topology import mark_sides
 from quasiharmonic.io.models.appearance import label_materials
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, mark, pad_to_space
@@ -25,9 +25,7 @@ def polygon_costs(mesh: MeshData, costs: FloatArray | None = None) -> FloatArray
     if mesh.polygons is None:
         return costs
     found = np.ones(mesh.F.shape) if costs is None else costs.copy()
-    diagonals, n = mesh.polygons.diagonals(mesh.F), len(mesh.V)
-    keys = edge_keys(mesh.F, mesh.F[:, (1, 2, 0)], n)
-    found[np.isin(keys, pair_keys(diagonals, n))] = _INSIDE_POLYGON
+    found[mark_sides(mesh.F, mesh.polygons.diagonals(mesh.F), len(mesh.V))] = _INSIDE_POLYGON
     return found
 
 

@@ -321,11 +321,7 @@ def _extra_edges(graph: EdgeGraph, distance: FloatArray, before: IntArray) -> In
     free = ~graph.rim
     reached = np.flatnonzero(before >= 0)
     free[graph.numbers(reached, before[reached])] = False
-    # The two triangles of each edge.
-    order = np.argsort(graph.side.ravel(), kind="stable")
-    pair = np.flatnonzero(np.diff(graph.side.ravel()[order]) == 0)
-    number = graph.side.ravel()[order][pair]
-    one, other = order[pair] % len(graph.F), order[pair + 1] % len(graph.F)
+    one, other, number = graph.list_pairs()
     keep = free[number]
     number, one, other = number[keep], one[keep], other[keep]
     around = graph.cost[number] + distance[graph.ends[number]].sum(axis=1)

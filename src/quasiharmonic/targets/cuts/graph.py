@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.geometry.coarsening.levels import has_marked_corner
 from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
-from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, pair_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, pair_keys, pair_sides
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, pad_to_space, repeat_each, scale_to_unit
 
 # A concave edge with this dihedral bend, or a convex edge with twice as much, has half its cost.
@@ -88,11 +88,15 @@ class EdgeGraph:
         Half-edges on the outside have -1 for their opposite.
         """
         side = np.ascontiguousarray(self.side.T).ravel()
-        order = np.argsort(side, kind="stable")
-        first = np.flatnonzero(np.diff(side[order]) == 0)
+        one, other = pair_sides(side)
         opposite = np.full(side.size, -1)
-        opposite[order[first]], opposite[order[first + 1]] = order[first + 1], order[first]
+        opposite[one], opposite[other] = other, one
         return opposite, side
+
+    def list_pairs(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Return the two triangles at each interior edge, and the edge; (i,) int64 each, by the first triangle."""
+        one, other = pair_sides(self.side.T)
+        return one // 3, other // 3, self.side.T.ravel()[one]
 
     @cached_property
     def _stars(self) -> tuple[IntArray, IntArray]:
