@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import tempfile
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -184,6 +185,32 @@ def test_a_stored_session_continues_with_its_history(tmp_path):
     assert again.last("map").header["outline"] == "rect:1x1"
     assert not again.last("map").header["undo"]
     assert not again.last("map").header["unsaved"]
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply", ".off"])
+def test_a_stored_session_of_a_file_keeps_what_the_file_carries(tmp_path, suffix):
+    V, F = cat(6)
+    path = tmp_path / f"cat{suffix}"
+    io.write_mapped(path, io.MeshData(V, F, vt=V[:, :2], FT=F))
+    one = Visitor(*grid(4, 4), storage=Storage(tmp_path / "session"))
+    one.does("load", {"content": np.frombuffer(path.read_bytes(), np.uint8)}, name=path.name)
+    again = Visitor(storage=Storage(tmp_path / "session"), restore=True)
+    assert again.session.state.sheet.name == path.name
+    assert np.array_equal(again.last("map").arrays["places"], one.last("map").arrays["places"])
+    saved = [there.session.state.sheet.mesh.carried for there in (one, again)]
+    assert (saved[0] is None) == (saved[1] is None)
+
+
+def test_a_page_continues_without_a_store(tmp_path, monkeypatch):
+    one = Visitor(*cat(6), storage=Storage(tmp_path))
+
+    def refuse(path, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    one.does("outline", to="disk")
+    assert one.last("map").header["outline"] == "disk"
+    assert "No space left on device" in one.last("note").header["text"]
 
 
 def test_a_damaged_store_is_ignored(tmp_path):

@@ -50,6 +50,10 @@ class Document:
         """Total number of bytes of all views."""
         return sum(map(len, self.views))
 
+    def __reduce__(self) -> tuple[type[Document], tuple[dict[str, Any], list[bytes]]]:
+        """Return the contents for pickling, which cannot store a memoryview."""
+        return Document, (self.tree, list(map(bytes, self.views)))
+
     def copy(self) -> Document:
         """Return a copy to modify; the bytes are shared."""
         return Document(json.loads(json.dumps(self.tree)), list(self.views))

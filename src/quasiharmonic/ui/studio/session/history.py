@@ -64,9 +64,8 @@ class History:
             self.change(replace(self.state, selected=selected))
 
     def mark_saved(self) -> None:
-        """Remember that the current state was saved."""
+        """Remember that the current state was saved; `write` stores it."""
         self._saved = self._states[self._at][0]
-        self.write()
 
     def fields(self) -> dict[str, Any]:
         """Return what the controls of a page show about the history."""

@@ -117,7 +117,7 @@ class Session(PageUpdates):
         if texture is None:
             raise RequestError("this file is not a PNG or JPEG image")
         self._history.texture = texture
-        self._history.write()
+        self._store()
         self._send_image()
 
     def _do_select(self, frame: MessageFrame) -> None:
@@ -339,6 +339,7 @@ class Session(PageUpdates):
         for name, content in files.items():
             self._tell({"kind": "file", "name": name}, {"content": np.frombuffer(content, dtype=np.uint8)})
         self._history.mark_saved()
+        self._store()
         self._tell({"kind": "saved"}, {})
 
 

@@ -115,7 +115,16 @@ class PageUpdates:
         self._tell(*seams_message(state))
         self._tell_map(fields, everything=state.mapped)
         self._tell({"kind": "obstructions", "obstructions": describe_obstructions(state)}, {})
-        self._history.write()
+        self._store()
+
+    def _store(self) -> None:
+        """Store the session; if the disk is full, tell the page, which continues."""
+        try:
+            self._history.write()
+        except OSError as error:
+            reason = error.strerror or str(error)
+            text = f"the session cannot be stored ({reason}): save your map before you close or reload the page"
+            self._tell({"kind": "note", "level": "error", "text": text}, {})
 
     def _tell_map(
         self,
