@@ -28,8 +28,8 @@ from .apps.air_mesh import AirMesh as AirMesh
 from .apps.animation.frame_sequence import animate as animate
 from .apps.animation.frames import Animation as Animation
 from .apps.atlas.seam_cuts import cut_open as cut_open
-from .apps.baking.bake import BakeResult as BakeResult
-from .apps.baking.bake import bake as bake
+from .apps.baking import BakeResult as BakeResult
+from .apps.baking import bake as bake
 from .apps.displacement_fields.field_inversion import InverseField as InverseField
 from .apps.displacement_fields.field_inversion import inverse_field as inverse_field
 from .apps.displacement_fields.nearest import (
@@ -45,13 +45,20 @@ from .apps.gradients.derivative import Derivative as Derivative
 from .apps.gradients.map_derivatives import flatten_derivative as flatten_derivative
 from .apps.gradients.map_derivatives import polish_derivative as polish_derivative
 from .apps.gradients.map_derivatives import quasi_harmonic_derivative as quasi_harmonic_derivative
-from .apps.inverse.inverse_map import InverseMap as InverseMap
-from .apps.inverse.transfer import SurfaceMap as SurfaceMap
+from .apps.image_warp import (
+    WarpResult as WarpResult,
+)
+from .apps.image_warp import (
+    warp_along as warp_along,
+)
+from .apps.image_warp import (
+    warp_by_landmarks as warp_by_landmarks,
+)
+from .apps.inverse_map import InverseMap as InverseMap
 from .apps.mesh_motion.morph_result import MorphResult as MorphResult
 from .apps.mesh_motion.morphing import morph as morph
 from .apps.mesh_motion.moving_mesh import MovingMesh as MovingMesh
-from .apps.repair.uv_repair import RepairResult as RepairResult
-from .apps.repair.uv_repair import repair as repair
+from .apps.surface_map import SurfaceMap as SurfaceMap
 from .apps.tetrahedra.certificate import TetrahedraCertificate as TetrahedraCertificate
 from .apps.tetrahedra.certificate import certify_tetrahedra as certify_tetrahedra
 from .apps.tetrahedra.result import TetrahedraResult as TetrahedraResult
@@ -59,15 +66,8 @@ from .apps.tetrahedra.tetrahedral_maps import injective_tetrahedra as injective_
 from .apps.unwrapping.cleaning import clean as clean
 from .apps.unwrapping.result import UnwrapResult as UnwrapResult
 from .apps.unwrapping.unwrap import unwrap as unwrap
-from .apps.warping.image_warp import (
-    WarpResult as WarpResult,
-)
-from .apps.warping.image_warp import (
-    warp_along as warp_along,
-)
-from .apps.warping.image_warp import (
-    warp_by_landmarks as warp_by_landmarks,
-)
+from .apps.uv_repair import RepairResult as RepairResult
+from .apps.uv_repair import repair as repair
 from .energies.energies import Energy as Energy
 from .energies.measures import Distortion as Distortion
 from .energies.measures import distortion as distortion

@@ -10,14 +10,14 @@ from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
 from quasiharmonic.apps.atlas.packing.pack import Packing
 from quasiharmonic.apps.atlas.seam_cuts import CutMesh
-from quasiharmonic.apps.baking.bake import BakeResult
+from quasiharmonic.apps.baking import BakeResult
 from quasiharmonic.apps.displacement_fields.field_inversion import InverseField
 from quasiharmonic.apps.displacement_fields.nearest import InvertibleField
 from quasiharmonic.apps.displacement_fields.voxels import InverseVolume, InvertibleVolume, VoxelVerdict
 from quasiharmonic.apps.gradients.derivative import Derivative
-from quasiharmonic.apps.inverse.inverse_map import ChartInverse, SurfacePoints
+from quasiharmonic.apps.image_warp import WarpResult
+from quasiharmonic.apps.inverse_map import ChartInverse, SurfacePoints
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
-from quasiharmonic.apps.repair.uv_repair import RepairedIsland, RepairResult
 from quasiharmonic.apps.tetrahedra.certificate import TetrahedraCertificate
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult, TetrahedraStatus
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
@@ -25,7 +25,7 @@ from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStatus, UnwrapStep
 from quasiharmonic.apps.unwrapping.scenes import ScenePart, SceneResult
 from quasiharmonic.apps.unwrapping.straightening import Strip
-from quasiharmonic.apps.warping.image_warp import WarpResult
+from quasiharmonic.apps.uv_repair import RepairedIsland, RepairResult
 from quasiharmonic.energies.distances import DistanceError
 from quasiharmonic.energies.measures import Distortion, Statistics
 from quasiharmonic.geometry.exact.certificate import Certificate

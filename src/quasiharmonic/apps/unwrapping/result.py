@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.inverse.inverse_map import ChartInverse
+from quasiharmonic.apps.inverse_map import ChartInverse
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry

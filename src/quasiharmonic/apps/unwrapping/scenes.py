@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.inverse.inverse_map import ChartInverse
+from quasiharmonic.apps.inverse_map import ChartInverse
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.model_files import label_statements
 from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStatus

@@ -65,7 +65,7 @@ def _read(_: argparse.Namespace, path: Path) -> MeshData:
 
 def _bake(options: argparse.Namespace, new: MeshData) -> pipeline.Changed:
     """Bake the look of the old model."""
-    from quasiharmonic.apps.baking.bake import bake
+    from quasiharmonic.apps.baking import bake
 
     old = _read(options, options.input)
     with pipeline.show_work(options.new):

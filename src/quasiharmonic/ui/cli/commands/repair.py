@@ -53,7 +53,7 @@ def _repair(options: argparse.Namespace, mesh: MeshData) -> pipeline.Changed:
     from dataclasses import replace
 
     from quasiharmonic.apps.atlas.atlas_verdict import certify
-    from quasiharmonic.apps.repair.uv_repair import repair
+    from quasiharmonic.apps.uv_repair import repair
     from quasiharmonic.io.seamed_mesh import SeamedMesh
 
     if mesh.vt is None or mesh.FT is None or (mesh.FT < 0).any(axis=1).all():

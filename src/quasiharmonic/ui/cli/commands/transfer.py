@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.apps.inverse.inverse_map import InverseMap
-    from quasiharmonic.apps.inverse.transfer import SurfaceMap
+    from quasiharmonic.apps.inverse_map import InverseMap
+    from quasiharmonic.apps.surface_map import SurfaceMap
     from quasiharmonic.io import MeshData
 
 _TABLES = ".npy", ".csv", ".txt"
@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from quasiharmonic import io
-    from quasiharmonic.apps.inverse.transfer import SurfaceMap
+    from quasiharmonic.apps.surface_map import SurfaceMap
     from quasiharmonic.util.arrays import count_of
 
     set_default(options, "per", "vertex", asked=options.values is not None, belongs="--values")
@@ -177,7 +177,7 @@ def _read(path: Path) -> _MappedFile:
     import numpy as np
 
     from quasiharmonic import io
-    from quasiharmonic.apps.inverse.inverse_map import InverseMap
+    from quasiharmonic.apps.inverse_map import InverseMap
 
     mesh = io.read_mesh(path)
     V, F, uv = io.cut_at_seams(mesh)

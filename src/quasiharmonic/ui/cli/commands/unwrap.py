@@ -195,7 +195,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
     unwrapped = io.place_map(unwrapped, mesh, options.channel)
     baked = None
     if options.bake:
-        from quasiharmonic.apps.baking.bake import bake
+        from quasiharmonic.apps.baking import bake
 
         baked = bake(mesh, unwrapped, size=options.resolution)
         unwrapped = baked.mesh

@@ -16,7 +16,7 @@ from quasiharmonic.apps.atlas import island_functions as atlas
 from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, mirrored_islands
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, MappedIsland, each_island
 from quasiharmonic.apps.atlas.seam_cuts import cut_along, cut_apart
-from quasiharmonic.apps.repair.uv_repair import repair
+from quasiharmonic.apps.uv_repair import repair
 from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS, smooth
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import certify

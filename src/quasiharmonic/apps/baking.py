@@ -10,8 +10,15 @@ from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
-from quasiharmonic.apps.baking.images import Bytes, encode, find_sources, to_bytes
-from quasiharmonic.apps.baking.look import SurfaceLook, TangentFrames, tangent_frames
+from quasiharmonic.apps.model_look import (
+    Bytes,
+    SurfaceLook,
+    TangentFrames,
+    encode,
+    find_sources,
+    tangent_frames,
+    to_bytes,
+)
 from quasiharmonic.apps.unwrapping.model_files import add_map
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.geometry.mesh.point_queries import NearestPoint, Raster

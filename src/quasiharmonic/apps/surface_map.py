@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.inverse.inverse_map import InverseMap, Per, SurfacePoints
+from quasiharmonic.apps.inverse_map import InverseMap, Per, SurfacePoints
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import FloatArray, check_choice, check_instance
 

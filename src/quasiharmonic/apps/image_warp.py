@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.apps.inverse.inverse_map import InverseMap
-from quasiharmonic.apps.warping.landmarks import (
+from quasiharmonic.apps.inverse_map import InverseMap
+from quasiharmonic.apps.landmarks import (
     CurvePair,
     interpolate_border,
     is_on_border,
