@@ -33,9 +33,9 @@ from pathlib import Path
 import numpy as np
 
 from quasiharmonic import boundary_loops, certify, distortion, flatten, io, surfaces
-from quasiharmonic.apps.flattening.disk_start import make_fans
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from speed import machine
 

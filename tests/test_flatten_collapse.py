@@ -8,7 +8,7 @@ import pytest
 from quasiharmonic import Status, certify, distortion, find_cuts, flatten, inverted_triangles
 from quasiharmonic.apps.flattening.collapse import has_collapsed, stretch_of_boundary, worst_stretch
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.apps.flattening.multilevel import flatten_coarse
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.atlas import flatten as flatten_atlas
 from quasiharmonic.energies.energies import SymmetricDirichlet

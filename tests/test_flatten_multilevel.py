@@ -10,14 +10,8 @@ import pytest
 from quasiharmonic import Status, certify, distortion, find_cuts, flatten, is_injective
 from quasiharmonic.apps.flattening import free_boundary, piece
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.disk_start import map_to_disk
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import (
-    descend_level,
-    flatten_coarse,
-    smooth_map,
-    thick_energy,
-)
-from quasiharmonic.apps.flattening.multilevel.hierarchy import Hierarchy, Level
+from quasiharmonic.apps.flattening.multilevel import Hierarchy, Level, descend_level, flatten_coarse, map_to_disk
+from quasiharmonic.apps.flattening.patches import smooth_map, thick_energy
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet

@@ -9,9 +9,8 @@ import pytest
 
 from quasiharmonic import Status, certify, flatten
 from quasiharmonic.apps.flattening.piece import Piece
-from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
-from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, move_onto_pins
-from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
+from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, move_onto_pins, pin_obstructions
+from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.results import Forbids, Kind
 from quasiharmonic.surfaces import annulus, cat, disk, grid, random_delaunay
 from quasiharmonic.util.options import FlattenOptions
@@ -199,7 +198,7 @@ def test_pins_of_an_existing_map_are_never_called_impossible():
     for seed in range(10):
         V, F = random_delaunay(120, seed)
         fixed = rng.choice(len(V), 60, replace=False)
-        assert not pin_obstructions(F, len(V), edges(F, len(V)), fixed, V[fixed]).obstructions
+        assert not pin_obstructions(F, len(V), fixed, V[fixed]).obstructions
 
 
 def test_malformed_input_is_rejected():

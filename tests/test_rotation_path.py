@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import boundary_loops
-from quasiharmonic.apps.flattening.disk_start import map_to_disk
+from quasiharmonic.apps.flattening.multilevel import map_to_disk
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet

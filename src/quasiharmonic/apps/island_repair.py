@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.pins.obstructions import renumber_obstruction
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
@@ -27,7 +26,7 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges, components
 from quasiharmonic.io.seamed_mesh import Island
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
-from quasiharmonic.problem.diagnosis.obstruction import Obstruction
+from quasiharmonic.problem.diagnosis.obstruction import Obstruction, renumber_obstruction
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve_problem
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, edge_names, mark, names_of

@@ -1,4 +1,4 @@
-"""Split a mesh into its connected surfaces."""
+"""Connected surfaces of a mesh: split the mesh, align their maps and place these side by side."""
 
 from __future__ import annotations
 
@@ -7,9 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.piece import Piece
+from quasiharmonic.apps.flattening.piece import Piece, check_in_range
+from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.mesh.topology import components
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_range, invert_indices
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    check_range,
+    invert_indices,
+    to_complex,
+    to_points,
+)
 
 
 class Part(NamedTuple):
@@ -71,3 +80,50 @@ def unite_parts(parts: Sequence[Part]) -> Part:
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.triangles for part in parts]),
     )
+
+
+# Space between two components, relative to the largest side of all.
+_GAP = 0.05
+
+
+def align_with_axis(F: IntArray, uv: FloatArray) -> FloatArray:
+    """Rotate a map (n, 2) so that its principal axis is the x axis, with its bounding box at the origin.
+
+    The map is of about unit size, and the axis is that of the image's moments of inertia. The longer tail of the
+    image's area points to the right. The result has new rounding errors.
+    """
+    w = to_complex(uv)
+    area = signed_areas(F, w)
+    corners = w[F]
+    middle = corners.mean(axis=1)
+    centre = (area * middle).sum() / area.sum()
+    # Second moment of a triangle about a point, from its corners c and centroid m: area/12 (Σ c² + 9 m²).
+    spread = (area * (((corners - centre) ** 2).sum(axis=1) + 9 * (middle - centre) ** 2)).sum()
+    turned = (w - centre) * np.exp(-0.5j * np.angle(spread)) if abs(spread) > 0 else w - centre
+    along = turned[F].mean(axis=1).real
+    if (area * along**3).sum() < 0:
+        turned = -turned
+    aligned = to_points(turned)
+    return aligned - aligned.min(axis=0)
+
+
+def place_in_row(parts: Sequence[FloatArray], gap: float = 0.0) -> list[FloatArray]:
+    """Shift maps (n, 2) whose bounding boxes start at the origin so that they stand in a row.
+
+    The space between them is ``gap``, but at least a fixed fraction of the largest side of all. Raises ValueError if
+    the row exceeds the range of doubles.
+    """
+    gap = max(gap, _GAP * max(float(part.max()) for part in parts))
+    shifted, right = [], 0.0
+    with np.errstate(over="ignore"):
+        for part in parts:
+            shifted.append(part + np.array([right, 0.0]))
+            right = float(shifted[-1][:, 0].max()) + gap
+    return [check_in_range(positions) for positions in shifted]
+
+
+def fit_unit_square(uv: FloatArray) -> FloatArray:
+    """Scale a map uniformly, and centre it in the unit square."""
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    size = float((high - low).max())
+    return 0.5 + (uv - low - 0.5 * (high - low)) / size

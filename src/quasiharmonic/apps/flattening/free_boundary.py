@@ -18,17 +18,16 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.flattening.connected_parts import Part, split_parts
-from quasiharmonic.apps.flattening.distances.distance_descent import lower_distance_error
-from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
-from quasiharmonic.apps.flattening.layout import (
+from quasiharmonic.apps.flattening.connected_parts import (
+    Part,
     align_with_axis,
-    check_in_range,
     fit_unit_square,
     place_in_row,
-    to_given_unit,
+    split_parts,
 )
-from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece
+from quasiharmonic.apps.flattening.distances.distance_descent import lower_distance_error
+from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
+from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece, check_in_range, to_given_unit
 from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.polishing import find_energy

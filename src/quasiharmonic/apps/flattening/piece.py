@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.collapse import has_collapsed, thin_triangles
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.disk_start import map_to_disk
-from quasiharmonic.apps.flattening.layout import to_given_unit
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
 from quasiharmonic.apps.flattening.patches import PatchDescents
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
@@ -378,3 +376,16 @@ class Flattening:
             if energy <= most and not self._rim.meets_itself(uv):
                 return uv
         return self._bijective
+
+
+def check_in_range(uv: FloatArray) -> FloatArray:
+    """Return a map unchanged if it is finite; otherwise raise ValueError."""
+    if not np.isfinite(uv).all():
+        raise ValueError("the map is outside the range of doubles (1e308): scale the surface or the pins down")
+    return uv
+
+
+def to_given_unit(uv: FloatArray, exponent: int) -> FloatArray:
+    """Convert a map from units of ``2 ** exponent`` to the original unit; ValueError as `check_in_range`."""
+    with np.errstate(over="ignore"):
+        return check_in_range(np.ldexp(uv, exponent))

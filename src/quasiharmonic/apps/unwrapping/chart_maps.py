@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.disk_start import map_to_disk
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import flatten_coarse
+from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
 from quasiharmonic.apps.flattening.patches import descend_on_patches
 from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend

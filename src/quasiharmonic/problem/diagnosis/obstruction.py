@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -286,3 +286,14 @@ def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list
         end = high - 1
         chosen.insert(0, end)
     return chosen
+
+
+def renumber_obstruction(found: Obstruction, vertices: IntArray, triangles: IntArray) -> Obstruction:
+    """Return an obstruction of a part in the numbering of the mesh; ``vertices`` and ``triangles`` are the mesh's."""
+    return replace(
+        found,
+        vertices=vertices[found.vertices],
+        edges=vertices[found.edges],
+        triangles=triangles[found.triangles],
+        split=vertices[found.split],
+    )

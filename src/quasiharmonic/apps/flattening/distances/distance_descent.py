@@ -31,8 +31,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.layout import to_given_unit
-from quasiharmonic.apps.flattening.piece import Piece
+from quasiharmonic.apps.flattening.piece import Piece, to_given_unit
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.distances import Sampling, SurfaceDistances, sample_distances

@@ -19,19 +19,18 @@ from quasiharmonic.apps.flattening.distances.distance_descent import (
     lower_errors,
     make_descent,
 )
-from quasiharmonic.apps.flattening.layout import to_given_unit
-from quasiharmonic.apps.flattening.multilevel.coarse_flattening import (
+from quasiharmonic.apps.flattening.multilevel import (
     COARSEST,
     RATIO,
     STEPS,
+    Hierarchy,
+    Level,
     descend_level,
     flatten_levels,
     prolong_map,
-    smooth_map,
-    thick_energy,
 )
-from quasiharmonic.apps.flattening.multilevel.hierarchy import LOWEST, Hierarchy, Level
-from quasiharmonic.apps.flattening.piece import Piece
+from quasiharmonic.apps.flattening.patches import LOWEST, smooth_map, thick_energy
+from quasiharmonic.apps.flattening.piece import Piece, to_given_unit
 from quasiharmonic.energies.distances import SurfaceDistances, sample_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units

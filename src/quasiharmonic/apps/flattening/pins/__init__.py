@@ -1,4 +1,4 @@
-"""Flat maps with fixed vertices: impossible target positions, and initial maps that satisfy the others.
+"""Flat maps with fixed vertices: contradictory target positions, and maps that satisfy the others.
 
-The package builds on the flattening around it and on `problem.diagnosis`. Start reading in `pins`.
+The package builds on the flattening around it and on `problem.diagnosis`. Start reading in `pin_search`.
 """

@@ -19,13 +19,12 @@ import numpy as np
 
 from quasiharmonic.apps.flattening.connected_parts import Part, name_part, unite_parts
 from quasiharmonic.apps.flattening.contacts import nearest_on_edges
-from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions, renumber_obstruction
-from quasiharmonic.apps.flattening.pins.pin_search import PinSearch
+from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, pin_obstructions
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.loops import check_loops, winding
-from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.problem.diagnosis import Diagnosis
+from quasiharmonic.problem.diagnosis.obstruction import renumber_obstruction
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray, invert_indices
 from quasiharmonic.util.options import FlattenOptions
@@ -78,8 +77,7 @@ def flatten_pinned_parts(
     union = unite_parts(parts)
     found = _combine(union, results)
     if not found.certificate.bijective and found.status is not Status.INTERRUPTED:
-        n = int(F.max()) + 1
-        diagnosis = pin_obstructions(F, n, edges(F, n), fixed, target)
+        diagnosis = pin_obstructions(F, int(F.max()) + 1, fixed, target)
         failed = [k for k, result in enumerate(results) if not result.certificate.bijective]
         if diagnosis.forbids_bijective:
             found = replace(found, status=Status.IMPOSSIBLE, diagnosis=diagnosis)

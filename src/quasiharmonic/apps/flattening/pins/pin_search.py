@@ -1,4 +1,4 @@
-"""Bijective maps with fixed vertices and a boundary that is otherwise free.
+"""Bijective maps with fixed vertices and an otherwise free boundary, and contradictions between target positions.
 
 ::
 
@@ -15,24 +15,26 @@ harmless.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.apps.flattening.air_triangulation import triangulate_air
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.layout import to_given_unit
-from quasiharmonic.apps.flattening.piece import Flattening, Piece, energy_name
-from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
+from quasiharmonic.apps.flattening.piece import Flattening, Piece, energy_name, to_given_unit
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.exact.loops import contacts
+from quasiharmonic.geometry.exact.predicates import box_pairs_between, orientation
 from quasiharmonic.geometry.mesh.refinement import split_edges
-from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
+from quasiharmonic.geometry.mesh.topology import Edges, edge_keys, edges, pair_keys
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.diagnosis import Diagnosis, Kind
+from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction
+from quasiharmonic.problem.diagnosis.conditions import find_inverted_fixed
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.mapping import solve
@@ -41,9 +43,11 @@ from quasiharmonic.solver.search.stages import CoarseToFine, Stages, speed
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
+    edge_names,
     find_exponent,
     fixed_vertices,
     mark,
+    names_of,
     target_positions,
     to_complex,
 )
@@ -198,8 +202,7 @@ class PinSearch:
     def find_bijective(self, moved: FloatArray) -> None:
         """Find a bijective map with the target positions, from a bijective map (n, 2) without them."""
         piece = self._piece
-        n = len(piece.V)
-        diagnosis = pin_obstructions(piece.F, n, edges(piece.F, n), self._fixed, self._target)
+        diagnosis = pin_obstructions(piece.F, len(piece.V), self._fixed, self._target)
         if diagnosis.forbids_bijective:
             self.status, self._diagnosis = Status.IMPOSSIBLE, diagnosis
             return
@@ -323,3 +326,83 @@ class PinSearch:
         )
         undecided = result.injective and not result.certificate.bijective and self.status in _UNDECIDED
         return replace(result, status=Status.INJECTIVE) if undecided else result
+
+
+def pin_obstructions(F: IntArray, n: int, fixed: IntArray, target: FloatArray) -> Diagnosis:
+    """Find contradictions between the target positions (k, 2) of fixed vertices (k,), each given once.
+
+    The triangles have ``n`` vertices. The diagnosis reports vertices with the same target position, triangles of three
+    fixed vertices that are not counterclockwise, edges between two fixed vertices that intersect others or a fixed
+    vertex, and fixed vertices inside triangles of others. Each contradiction forbids a bijective map with any boundary.
+    An empty diagnosis proves nothing.
+    """
+    found, is_fixed = edges(F, n), mark(n, fixed)
+    where = np.zeros((n, 2))
+    where[fixed] = target
+    obstructions = [
+        *_find_shared_positions(fixed, target),
+        *_find_inverted(F, is_fixed, where, found),
+        *_find_crossings(is_fixed, where, found, fixed),
+        *_find_covered(F, is_fixed, where, fixed),
+    ]
+    return Diagnosis(tuple(obstructions), ("the boundary, because it is free",))
+
+
+def _find_shared_positions(fixed: IntArray, target: FloatArray) -> Iterator[Obstruction]:
+    order = np.lexsort((fixed, target[:, 1], target[:, 0]))
+    placed = target[order]
+    first = np.flatnonzero(np.concatenate([[True], (placed[1:] != placed[:-1]).any(axis=1)]))
+    for group in np.split(fixed[order], first[1:]):
+        if group.size > 1:
+            message = f"{names_of('Vertex', 'Vertices', group)} are fixed at the same position."
+            yield Obstruction(Kind.PIN, Forbids.BIJECTIVE, message, vertices=group)
+
+
+def _find_inverted(F: IntArray, is_fixed: NDArray[np.bool_], where: FloatArray, found: Edges) -> Iterator[Obstruction]:
+    for t, abc, s, split in find_inverted_fixed(F, is_fixed, where, found.boundary):
+        message = (
+            f"All vertices of {names_of('triangle', 'triangles', t)} are fixed, "
+            f"and their targets {'invert' if s < 0 else 'flatten'} it."
+        )
+        yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
+
+
+def _find_crossings(
+    is_fixed: NDArray[np.bool_], where: FloatArray, found: Edges, fixed: IntArray
+) -> Iterator[Obstruction]:
+    """Edges between fixed vertices that intersect other such edges or other fixed vertices."""
+    inner, outer = (pairs[is_fixed[pairs].all(axis=1)] for pairs in (found.interior, found.boundary))
+    segments = np.concatenate([inner, outer, np.stack([fixed, fixed], axis=1)])
+    joined = len(inner) + len(outer)
+    if not joined:
+        return
+    # Maximum number of intersecting pairs that are named.
+    max_pairs = 100
+    pairs = contacts(where, segments, max_pairs).pairs
+    # Vertices with the same position are reported by `_find_shared_positions`, so edges of length zero are omitted.
+    apart = (where[segments[:, 0]] != where[segments[:, 1]]).any(axis=1) | (np.arange(len(segments)) >= joined)
+    for i, j in pairs[(pairs[:, 0] < joined) & apart[pairs].all(axis=1)].tolist():
+        ends = segments[[i, j]]
+        other = edge_names(ends[1:]) if j < joined else names_of("vertex", "vertices", ends[1, :1])
+        message = f"Both ends of {edge_names(ends[:1])} are fixed, and the segment between them meets {other}."
+        split = ends[[k < len(inner) for k in (i, j)]]
+        kind = Kind.CHORD if len(split) else Kind.CROSSING
+        edges_ = ends if j < joined else ends[:1]
+        yield Obstruction(kind, Forbids.BIJECTIVE, message, vertices=np.unique(ends), edges=edges_, split=split)
+
+
+def _find_covered(
+    F: IntArray, is_fixed: NDArray[np.bool_], where: FloatArray, fixed: IntArray
+) -> Iterator[Obstruction]:
+    """Fixed vertices inside a triangle of other fixed vertices."""
+    fixed_triangles = np.flatnonzero(is_fixed[F].all(axis=1))
+    corners = where[F[fixed_triangles]]
+    positions = where[fixed]
+    for i, j in box_pairs_between(corners.min(axis=1), corners.max(axis=1), positions, positions):
+        sign = [orientation(corners[i, k], corners[i, k - 2], positions[j]) for k in range(3)]
+        inside = (np.minimum.reduce(sign) > 0).nonzero()[0]
+        for t, pin in zip(fixed_triangles[i[inside]].tolist(), fixed[j[inside]].tolist(), strict=True):
+            message = f"Vertex {pin} is fixed inside triangle {t}, whose vertices are all fixed as well."
+            yield Obstruction(
+                Kind.PIN, Forbids.BIJECTIVE, message, vertices=np.array([pin, *F[t]]), triangles=np.array([t])
+            )

@@ -1,4 +1,7 @@
-"""Coarse meshes of a surface with coarse boundaries, and the prolongation of maps to finer meshes.
+"""Initial bijective maps: of a coarse mesh onto a disk, and prolonged from mesh to mesh to the surface.
+
+A limb of a thousand triangles, which a map into a disk shrinks to a millionth, has about ten triangles on the coarse
+mesh. So steps on the coarse mesh replace steps on the whole mesh, also to resolve overlaps.
 
 Each boundary loop is filled by a fan around a new vertex, its *hub*. Boundary vertices then become interior vertices,
 and `quasiharmonic.geometry.coarsening.levels` can remove them like others. Hubs are kept, and get no new edges. Without
@@ -7,29 +10,52 @@ the hubs, a coarse mesh with coarse loops remains.
 Prolongation lays the ring of each removed vertex out flat around it by its rest angles and lengths. The affine map that
 fits the flat ring best to the ring's current positions also maps the vertex. If this inverts a triangle, the vertex
 gets the position that gives its triangles the best shape, as in `quasiharmonic.geometry.coarsening.prolongation`. This
-position is inside its ring and the coarse image.
+position is inside its ring and the coarse image. A prolonged map is improved locally before Newton steps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
+from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.patches import LOWEST, smooth_map, thick_energy
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
+from quasiharmonic.energies.energies import SymmetricDirichlet
+from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.coarsening.levels import coarsen
 from quasiharmonic.geometry.coarsening.prolongation import reinsertion_positions
+from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.fans import make_fans
+from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, invert_indices, mark
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.result import Status
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, invert_indices, mark, to_points
 
 # Weight that keeps the affine map close to a similarity.
 _RIGID = 1e-2
 # The affine position is used if every triangle has at least this fraction of its area in the flat layout.
 _MIN_AREA_SHARE = 0.05
-#: Minimum height of a coarse mesh's triangles, relative to their longest side.
-LOWEST = 0.05
 # Maximum sum of the angles around a boundary vertex when its ring is laid out.
 _WIDEST = 1.9 * np.pi
+# Below this mean energy a map has little distortion.
+_LITTLE = 1.0
+#: Number of vertices of the coarsest mesh.
+COARSEST = 150
+#: Minimum ratio between the vertex counts of successive meshes.
+RATIO = 4.0
+# Tolerance on coarse meshes, whose maps are only starts.
+_TOLERANCE = 1e-1
+#: Maximum number of steps on the coarsest mesh, and on the others.
+STEPS = (300, 40)
+# Heights of ears above their edges, relative to the edges; tried in turn until the map is bijective.
+_HEIGHTS = tuple(0.3 * 4.0**-k for k in range(18))
+# From this height on, all boundary vertices are placed inside the coarse image, not only those at intersections.
+_LATE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,3 +250,123 @@ def _fan_positive(ring: ComplexArray) -> BoolArray:
     twice_area: FloatArray = (arm[:, :-1].conj() * arm[:, 1:]).imag
     positive: BoolArray = np.all(twice_area > 0, axis=1)
     return positive
+
+
+def flatten_coarse(
+    V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_solver: str = "auto", *, guarded: bool = False
+) -> FloatArray | None:
+    """Flatten a coarse mesh, and prolong its map to the surface.
+
+    ``V`` (n, 3) is of about unit size, and the surface is connected and has no handles. With ``guarded`` the boundary
+    is guarded against overlaps from the beginning, otherwise where it overlaps itself. Return a bijective map (n, 2)
+    with moderate distortion, or None if rounding prevents one.
+    """
+    hierarchy = Hierarchy(V, F, list(loops), COARSEST)
+    return flatten_levels(hierarchy, hierarchy.select_stops(RATIO), linear_solver, guarded=guarded)
+
+
+def flatten_levels(
+    hierarchy: Hierarchy, stops: Sequence[int], linear_solver: str = "auto", *, guarded: bool = False
+) -> FloatArray | None:
+    """Flatten the coarsest of several meshes, and prolong its map to each finer one, with descents on all but the last.
+
+    ``stops`` are some of the hierarchy's stops, coarsest first. Return a bijective map (m, 2) of the last mesh, or None
+    if rounding prevents one.
+    """
+    here: Level | None = None
+    uv: FloatArray | None = None
+    for stop in stops:
+        level = hierarchy.level(stop)
+        if here is None:
+            uv = map_to_disk(hierarchy.V[level.vertices], level.F, level.loops, linear_solver)
+        else:
+            assert uv is not None
+            uv = prolong_map(hierarchy, here, level, uv, linear_solver)
+        if uv is None or stop == stops[-1]:
+            return uv
+        uv, guarded = descend_level(
+            hierarchy.V[level.vertices], level, uv, linear_solver, guarded, STEPS[here is not None]
+        )
+        here = level
+    return uv
+
+
+def prolong_map(
+    hierarchy: Hierarchy, here: Level, there: Level, uv: FloatArray, linear_solver: str = "auto"
+) -> FloatArray | None:
+    """Prolong a bijective map of one level to a finer one, and smooth it; None if no bijective map was found."""
+    w = np.zeros(len(hierarchy.V), dtype=np.complex128)
+    w[here.vertices] = in_units(uv, 0)
+    rim = Rim(there.loops)
+    kept_inside = np.zeros(w.size, dtype=bool)
+    fine: ComplexArray | None = None
+    for height in _HEIGHTS:
+        fine = hierarchy.prolong(w, here.stop, there.stop, kept_inside, height, fine)
+        uv = to_points(fine[there.vertices])
+        met = rim.meetings(uv)
+        if not met.size and is_injective(there.F, uv):
+            return smooth_map(hierarchy.V[there.vertices], there.F, there.loops, uv, linear_solver)
+        # Boundary vertices at intersections are placed inside the coarse image, and from _LATE on all of them.
+        late = height < _LATE
+        kept_inside[there.vertices if late else there.vertices[met]] = True
+    return None
+
+
+def descend_level(
+    V: FloatArray, level: Level, uv: FloatArray, linear_solver: str, guarded: bool, steps: int
+) -> tuple[FloatArray, bool]:
+    """Lower the symmetric Dirichlet energy of a level's bijective map, if ``guarded`` with a guard from the beginning.
+
+    Return the map, and whether finer levels need a guard from the beginning: where a map with little distortion
+    overlaps itself, only the coarse boundary does so.
+    """
+    rim = Rim(level.loops)
+    energy = thick_energy(V, level.F)
+
+    def lower(rim: Rim | None) -> FloatArray:
+        descent = SurfaceDescent(energy, uv, linear_solver, rim=rim, iterate=True)
+        for _ in islice(descend(descent, SymmetricDirichlet(), _TOLERANCE), steps):
+            pass
+        return descent.uv
+
+    if not guarded:
+        free = lower(None)
+        apart = rim.pull_apart(level.F, free) if rim.meets_itself(free) else free
+        if apart is not None:
+            return apart, False
+        guarded = energy.value(in_units(free, 0)) > _LITTLE
+    energy.energy = SymmetricDirichlet()
+    return lower(rim), guarded
+
+
+def map_to_disk(
+    V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_solver: str = "auto"
+) -> FloatArray | None:
+    """Map a surface into a disk of its area, with its longest loop on the circle by arc length.
+
+    ``V`` (n, 3) is of about unit size, and the surface is connected and has no handles. Return a bijective map (n, 2),
+    or None if none was found in double precision. Ctrl-C raises KeyboardInterrupt.
+    """
+    # The search's modules take longer to import than `unwrap` takes for a model of flat parts, which needs none.
+    from quasiharmonic.solver.mapping import solve
+
+    lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
+    longest = int(np.argmax([length.sum() for length in lengths]))
+    outer = loops[longest]
+    holes = [loop for k, loop in enumerate(loops) if k != longest]
+    # Edges of length zero get a small length, so that no two vertices share a position.
+    length = lengths[longest] + 1e-6 * lengths[longest].mean()
+    angle = 2 * np.pi * np.cumsum(length) / length.sum()
+    radius = np.sqrt(surface_area(V, F) / np.pi)
+    circle = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    problem = Problem(
+        np.concatenate([V, *(V[hole].mean(axis=0)[None] for hole in holes)]),
+        np.concatenate([F, make_fans(holes, len(V))]),
+        outer,
+        circle,
+        reference="equilateral",
+    )
+    result = solve(problem, linear_solver=linear_solver, max_iterations=200)
+    if result.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    return result.uv[: len(V)] if result.injective else None
