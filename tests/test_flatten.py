@@ -11,8 +11,8 @@ from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.derivatives import check_energy
 from quasiharmonic.energies.energies import Deformation, Isotropic, SymmetricDirichlet
+from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.surfaces import annulus, cat, disk, grid
 from shared.distinct_steps import DistinctSteps
 

@@ -8,11 +8,10 @@ import pytest
 from quasiharmonic import Status, is_injective, polish
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import MIPS, SymmetricDirichlet
-from quasiharmonic.energies.newton import progressive_reference as approach
+from quasiharmonic.energies.newton import distant_starts as approach
+from quasiharmonic.energies.newton.distant_starts import REACH, ReweightedDirichlet, reference_energy
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent
-from quasiharmonic.energies.newton.progressive_reference import REACH, reference_energy
-from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.surfaces import disk
 
 RINGS = 12

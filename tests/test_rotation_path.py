@@ -8,8 +8,8 @@ from quasiharmonic.apps.flattening.multilevel import map_to_disk
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
-from quasiharmonic.energies.newton.rotation_path import RotationPath
+from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
+from quasiharmonic.energies.newton.line_search import RotationPath
 from quasiharmonic.surfaces import grid, random_delaunay
 
 rng = np.random.default_rng(5)

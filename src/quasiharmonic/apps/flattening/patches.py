@@ -19,8 +19,8 @@ from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.surface_descent import NEAR_ENERGY, SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
+from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.geometry.coarsening.levels import has_marked_corner
 from quasiharmonic.geometry.coarsening.prolongation import are_positive
 from quasiharmonic.geometry.mesh.reference import rest_frames, rest_shapes

@@ -18,8 +18,8 @@ from quasiharmonic.apps.flattening.patches import PatchDescents
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, is_injective
 from quasiharmonic.geometry.mesh.reference import surface_area

@@ -15,13 +15,11 @@ import numpy as np
 from quasiharmonic.apps.flattening.contacts import HATS, Rim, RimContacts
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Energy, QuadraticForm
-from quasiharmonic.energies.newton.iterated_descent import IteratedDescent
-from quasiharmonic.energies.newton.line_search import backtrack, extend
+from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
+from quasiharmonic.energies.newton.line_search import RotationPath, backtrack, extend, rates
 from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, NewtonObjective, in_units
-from quasiharmonic.energies.newton.newton_descent import NewtonState
+from quasiharmonic.energies.newton.newton_descent import IteratedDescent, NewtonState
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
-from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
-from quasiharmonic.energies.newton.rotation_path import RotationPath, rates
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray

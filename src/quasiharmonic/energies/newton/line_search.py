@@ -1,7 +1,19 @@
-"""Parts of a line search: backtracking with Armijo's rule, and extension beyond Newton's step.
+"""Parts of a line search: backtracking with Armijo's rule, extension beyond Newton's step, and curved paths.
 
 `map_model` combines them to the line search of Newton's method on positions, and sets its constants. `sliding_boundary`
 and `surface_descent` do so for their paths. Gradient methods on tensors (`solver.methods`) do not use this module.
+
+A `RotationPath` is for maps with large rotations. A strip that rolls up hardly strains its triangles but rotates them
+by whole turns. Along a straight line, a triangle that rotates by θ grows by ``√(1 + θ²)``. So the energy permits only
+small rotations per step. Hundreds of full steps each lower the energy by one percent. With the angular velocity
+``θ = Im dp/p`` of a triangle along a direction, the path::
+
+    p(t) = e^{iθt} (p + t (dp − iθp)),    q(t) = e^{iθt} (q + t (dq − iθq))
+
+is tangent to the straight line and rotates the triangle without strain. Triangles rotated separately do not fit
+together. The map whose derivatives are closest to these, weighted by rest area, is the solution of a linear system with
+a constant Laplacian. At first order the triangles fit, so the path is tangent to the direction. A step along it has the
+same expected decrease as Newton's step.
 """
 
 from __future__ import annotations
@@ -9,7 +21,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
-from quasiharmonic.util.arrays import FloatArray
+import numpy as np
+
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, sum_at
 from quasiharmonic.util.progress import heartbeat
 
 S = TypeVar("S")
@@ -109,3 +125,60 @@ def extend(
             break
         taken = AcceptedStep(longer * taken.t, value, there)
     return taken
+
+
+def rates(F: IntArray, g: ComplexArray, w: ComplexArray, direction: ComplexArray) -> ComplexArray:
+    """``dp/p`` of every triangle (f,) along a direction: the growth rate plus ``i`` times the angular velocity."""
+    corners = F.T
+    rate: ComplexArray = np.sum(g.conj() * direction[corners], axis=0) / np.sum(g.conj() * w[corners], axis=0)
+    return rate
+
+
+class RotationPath:
+    """Rotation paths of maps of one mesh, each of whose vertices is in a triangle.
+
+    ``g`` (3, f) is as in `NewtonSystem`. Each component has at least one fixed vertex. The constructor raises
+    `NotPositiveDefinite` if rest triangles differ too much for a positive definite Laplacian; see `of`.
+    """
+
+    def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
+        self._F, self._corners = F, np.ascontiguousarray(F.T)
+        self._g = g
+        # The cross product of the gradients gives the area up to a common factor.
+        self._area: FloatArray = 1 / np.abs((g[1].conj() * g[2]).imag)
+        stiffness = 2 * self._area * (g * g[(1, 2, 0), :].conj()).real
+        self._laplacian = Laplacian(F, n, fixed, linear_solver).factor(stiffness)
+
+    @classmethod
+    def of(
+        cls, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto"
+    ) -> RotationPath | None:
+        """Create a `RotationPath`, or return None if rounding leaves no positive definite Laplacian."""
+        try:
+            return cls(F, g, n, fixed, linear_solver)
+        except NotPositiveDefinite:
+            return None
+
+    def path(self, w: ComplexArray, direction: ComplexArray) -> Callable[[float], ComplexArray]:
+        """Return a path through a map (n,) complex128 along a direction (n,), which is zero at the fixed vertices.
+
+        It maps a length t to a map, ``w + t · direction`` to first order. It may raise `NotPositiveDefinite` if
+        rounding leaves no correct digit.
+        """
+        (p, q), (dp, dq) = self._derivatives(w), self._derivatives(direction)
+        angle = rates(self._F, self._g, w, direction).imag
+        strain_p, strain_q = dp - 1j * angle * p, dq - 1j * angle * q
+
+        def at(t: float) -> ComplexArray:
+            turned = np.exp(1j * t * angle)
+            beyond_p = turned * (p + t * strain_p) - (p + t * dp)
+            beyond_q = turned * (q + t * strain_q) - (q + t * dq)
+            load = self._area * (beyond_p * self._g + beyond_q * self._g.conj())
+            return w + t * direction + self._laplacian.respond(sum_at(self._corners.ravel(), load.ravel(), w.size))
+
+        return at
+
+    def _derivatives(self, w: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """``∂w/∂z`` and ``∂w/∂z̄`` on every triangle, (f,) complex128 each."""
+        corners = w[self._corners]
+        return np.sum(self._g.conj() * corners, axis=0), np.sum(self._g * corners, axis=0)

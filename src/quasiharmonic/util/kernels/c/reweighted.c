@@ -1,4 +1,4 @@
-/* Kernels of `energies/newton/reweighted.py`. */
+/* Kernels of `energies/newton/distant_starts.py`. */
 #include "arguments.h"
 
 #include <math.h>
