@@ -13,7 +13,7 @@ from quasiharmonic.linsolve import base, laplacian
 from quasiharmonic.problem import domain
 from quasiharmonic.solver import mapping
 from quasiharmonic.solver.field.objective import Iterate, Objective
-from quasiharmonic.solver.search import coarse, record, search
+from quasiharmonic.solver.search import record, search
 
 # The available clocks: wall time or CPU time.
 clock = time.perf_counter
@@ -25,8 +25,8 @@ _CLOCKED: tuple[tuple[Any, str, str], ...] = (
     (domain.Domain, "__init__", "set-up"),
     (reference.ReferenceMesh, "__init__", "set-up"),
     (laplacian.Laplacian, "__init__", "set-up"),
-    (coarse, "coarsen", "coarsening"),
-    (coarse, "prolong", "prolongation"),
+    (search, "coarsen", "coarsening"),
+    (search, "prolong", "prolongation"),
     (search, "polish_map", "polish"),
     (base.LinearSolver, "__init__", "analysis"),
     (Objective, "evaluate", "assembly"),

@@ -23,7 +23,7 @@ from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.search import search
-from quasiharmonic.solver.search.coarse import CoarseMesh, coarse_mesh
+from quasiharmonic.solver.search.search import CoarseMesh, coarse_mesh
 from quasiharmonic.solver.search.stages import CoarseToFine, speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from quasiharmonic.targets import arc_length, letter

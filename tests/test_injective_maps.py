@@ -12,10 +12,9 @@ from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem.problem import set_up_batch
-from quasiharmonic.solver.field.objective_batch import Patterns
 from quasiharmonic.solver.methods import Newton, VectorAdam
 from quasiharmonic.solver.search import first_stage, many
-from quasiharmonic.solver.search.first_stage import run_first_stage
+from quasiharmonic.solver.search.first_stage import Patterns, run_first_stage
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from quasiharmonic.util.options import MapOptions
 from shared.exact import inverted

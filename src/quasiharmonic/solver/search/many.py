@@ -21,8 +21,7 @@ from quasiharmonic.io.adapters.objects import mesh_arrays, stands_for_mesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.problem import set_up_batch
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.solver.field.objective_batch import Patterns
-from quasiharmonic.solver.search.first_stage import GROUP, SMALL, group_by_first_stage, run_first_stage
+from quasiharmonic.solver.search.first_stage import GROUP, SMALL, Patterns, group_by_first_stage, run_first_stage
 from quasiharmonic.solver.search.search import Search, finish_search, search_map
 from quasiharmonic.solver.search.stages import STRATEGIES, Stages
 from quasiharmonic.util.arrays import check_callback, check_choice, check_integer, check_sequence

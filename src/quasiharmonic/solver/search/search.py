@@ -1,26 +1,33 @@
 """Run stages one after another until one finds a map without inverted triangles (§9.2).
 
 If no stage finds one, the search reports the reason if a diagnosis proves it, and then returns the map of least area.
+
+Stages for large meshes run on a coarse mesh that keeps all fixed vertices, because the number of iterations does not
+depend on the mesh size, but the cost of each does. The map is then transferred to the fine mesh vertex by vertex,
+without any factorisation or descent there.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from quasiharmonic.energies.polishing import polish_map
+from quasiharmonic.geometry.coarsening.levels import coarsen
+from quasiharmonic.geometry.coarsening.prolongation import prolong
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.linsolve import NotPositiveDefinite, available
-from quasiharmonic.problem import Frame, Problem
+from quasiharmonic.problem import Domain, Frame, Problem
 from quasiharmonic.problem.result import MapResult, Stage, Status
 from quasiharmonic.problem.run import finish
 from quasiharmonic.solver.methods import Descent, LineShift, Newton, Untangling, VectorAdam
 from quasiharmonic.solver.methods.base import SearchState
 from quasiharmonic.solver.methods.local_repair import MAX_INVERTED
-from quasiharmonic.solver.search.coarse import coarse_mesh
 from quasiharmonic.solver.search.record import (
     BestMap,
     RepairBudget,
@@ -31,7 +38,7 @@ from quasiharmonic.solver.search.record import (
     visit_rounds,
 )
 from quasiharmonic.solver.search.stages import Stages, stages_of
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, map_array
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, map_array, mark, pad_to_space
 from quasiharmonic.util.options import MapOptions, PolishOptions
 
 if TYPE_CHECKING:
@@ -44,6 +51,31 @@ _FAILED_REPAIRS, _FAILED_REPAIRS_OF_TOUCHING = 16, 2
 LOCAL_REPAIRS = (LineShift(resume=True),)
 # Stages that follow the first stage on a coarse mesh.
 _COARSE_STAGES = *LOCAL_REPAIRS, Untangling(resume=True), *LOCAL_REPAIRS
+
+
+class CoarseTuning(NamedTuple):
+    """Numbers that tune the coarse mesh and its use."""
+
+    # Vertices of the coarse mesh, as a fraction of the fine mesh's.
+    share: float = 1 / 8
+    # Maximum number of vertices of the coarse mesh, unless the fixed vertices, all of which are kept, require more.
+    max_vertices: int = 1000
+    # This many vertices per fixed vertex suffice to grade the triangles from the boundary to the interior.
+    vertices_per_fixed: int = 3
+    # Coarsening to this fraction of the vertices or more saves too little.
+    worthwhile: float = 0.5
+    # Meshes with fewer vertices are not coarsened, because searching them is fast.
+    min_vertices: int = 1500
+    # Coarse triangles whose height is below this fraction of their longest side carry no useful shape, and their
+    # weights in an energy exceed double precision.
+    min_height: float = 1e-3
+    # Corners of such triangles are moved by up to this fraction of the shortest edge there.
+    perturbation: float = 0.2
+
+
+_COARSE = CoarseTuning()
+# Coarse meshes of the domains in use; None if a domain has none.
+_COARSE_MESHES: WeakKeyDictionary[Domain, CoarseMesh | None] = WeakKeyDictionary()
 
 
 def allowed_repairs(problem: Problem, max_iterations: int) -> int:
@@ -289,3 +321,64 @@ def result_of(
         reference=search.best_reference,
         V=search.problem.V,
     )
+
+
+class CoarseMesh:
+    """A coarse mesh that keeps the fixed vertices of a fine one, with the prolongation to the fine mesh.
+
+    ``goal`` is the approximate number of vertices. ``domain`` is the coarse mesh, with the same fixed vertices in the
+    same order.
+    """
+
+    def __init__(self, fine: Domain, goal: int) -> None:
+        self._fixed = mark(fine.n, fine.fixed)
+        self._coarsening = coarsen(fine.F, fine.n, self._fixed, goal)
+        self._vertices = np.flatnonzero(mark(fine.n, self._coarsening.F))
+        number = invert_indices(fine.n, self._vertices)
+        F = number[self._coarsening.F]
+        self.domain = Domain(_perturb_flat(fine.V[self._vertices], F), F, number[fine.fixed])
+
+    def prolong(self, w: ComplexArray) -> ComplexArray:
+        """Extend a map of the coarse mesh to the fine mesh, in the same frame.
+
+        The result is injective if ``w`` is, except for rounding.
+        """
+        fine = np.zeros(self._fixed.size, dtype=np.complex128)
+        fine[self._vertices] = w
+        return prolong(fine, self._coarsening, self._fixed)
+
+
+def coarse_mesh(problem: Problem) -> CoarseMesh | None:
+    """Return the coarse mesh of a large problem, computed once per domain.
+
+    None if the mesh is small, most of its vertices are fixed, or the problem prescribes its own reference triangles.
+    """
+    if problem.reference not in (None, "equilateral"):
+        return None
+    fine = problem.domain
+    if fine not in _COARSE_MESHES:
+        goal = int(max(_COARSE.vertices_per_fixed * fine.fixed.size, min(_COARSE.share * fine.n, _COARSE.max_vertices)))
+        worthwhile = fine.n >= _COARSE.min_vertices and goal < _COARSE.worthwhile * fine.n
+        _COARSE_MESHES[fine] = CoarseMesh(fine, goal) if worthwhile else None
+    return _COARSE_MESHES[fine]
+
+
+def _perturb_flat(V: FloatArray, F: IntArray) -> FloatArray:
+    """Return positions in space, perturbed slightly at the corners of triangles that have almost no area.
+
+    The shape of a coarse triangle is only a rough guide to the size of the fine triangles.
+    """
+    shapes = rest_shapes(V, F)
+    lengths = np.abs(shapes.sides)
+    low = ~(2 * shapes.m >= _COARSE.min_height * lengths.max(axis=0) ** 2)
+    if not low.any():
+        return V
+    space = pad_to_space(V)
+    shortest = np.full(len(V), np.inf)
+    for length, ends in zip(lengths, ((0, 1), (1, 2), (2, 0)), strict=True):
+        for corner in ends:
+            np.minimum.at(shortest, F[:, corner], np.where(length > 0, length, np.inf))
+    corners = np.unique(F[low])
+    by = _COARSE.perturbation * shapes.unit * shortest[corners, None]
+    space[corners] += by * np.random.default_rng(0).uniform(-1, 1, (corners.size, 3))
+    return space

@@ -25,8 +25,7 @@ from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.problem import Given, set_up_batch
 from quasiharmonic.problem.result import MapResult
-from quasiharmonic.solver.field.objective_batch import Patterns
-from quasiharmonic.solver.search.first_stage import SMALL, group_by_first_stage, run_first_stage
+from quasiharmonic.solver.search.first_stage import SMALL, Patterns, group_by_first_stage, run_first_stage
 from quasiharmonic.ui.batch import island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages

@@ -29,7 +29,7 @@ from quasiharmonic.problem.result import MapResult, RefinementAttempt, Stage, St
 from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.construction.constructing import Construction, constructions, is_simple, refined_problem
 from quasiharmonic.solver.construction.thinning import thin_refinement
-from quasiharmonic.solver.refine.refining import refine_problem
+from quasiharmonic.solver.refining import refine_problem
 from quasiharmonic.solver.search.record import RepairBudget
 from quasiharmonic.solver.search.search import allowed_repairs, search_map
 from quasiharmonic.solver.search.stages import Stages, quick_stages, stages_of, without_restarts
