@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, animate, boundary_loops, certify, io, polish
-from quasiharmonic.apps.animation.motion_smoothing import ProximalPenalty
+from quasiharmonic.apps.mesh_motion.motion_smoothing import ProximalPenalty
 from quasiharmonic.results import FrameStep
 from quasiharmonic.surfaces import cat, disk
 from quasiharmonic.ui.cli import main
@@ -233,7 +233,7 @@ def test_interrupted_before_the_first_frame(head, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("quasiharmonic.apps.animation.frame_sequence.solve", interrupted)
+    monkeypatch.setattr("quasiharmonic.apps.mesh_motion.frame_sequence.solve", interrupted)
     targets = turning_stars(len(loop), 3)
     animation = animate(Problem(V, F, loop, targets[0]), targets, polish="mips", fill_gaps=True)
     assert animation.interrupted

@@ -15,8 +15,7 @@ from quasiharmonic.geometry.mesh.refinement import split_edges
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.solver.construction.constructing import construct_and_thin, is_simple
 from quasiharmonic.solver.construction.cutting import Cutting, walk
-from quasiharmonic.solver.construction.regions import Regions
-from quasiharmonic.solver.construction.sheet import HalfEdges, Sheet
+from quasiharmonic.solver.construction.half_edges import HalfEdges, Regions, Sheet
 from quasiharmonic.solver.construction.thinning import quality, thin_refinement, triangulate_best
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods.local_repair import remap_patches

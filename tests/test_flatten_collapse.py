@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Status, certify, distortion, find_cuts, flatten, inverted_triangles
-from quasiharmonic.apps.flattening.collapse import has_collapsed, stretch_of_boundary, worst_stretch
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.multilevel import flatten_coarse
+from quasiharmonic.apps.flattening.worst_triangles import has_collapsed, stretch_of_boundary, worst_stretch
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.atlas import flatten as flatten_atlas
 from quasiharmonic.energies.energies import SymmetricDirichlet

@@ -11,7 +11,7 @@ from quasiharmonic import Status, certify, distortion, find_cuts, flatten, is_in
 from quasiharmonic.apps.flattening import free_boundary, piece
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.multilevel import Hierarchy, Level, descend_level, flatten_coarse, map_to_disk
-from quasiharmonic.apps.flattening.patches import smooth_map, thick_energy
+from quasiharmonic.apps.flattening.worst_triangles import smooth_map, thick_energy
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet

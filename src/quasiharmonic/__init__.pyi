@@ -25,8 +25,6 @@ from . import (
     targets as targets,
 )
 from .apps.air_mesh import AirMesh as AirMesh
-from .apps.animation.frame_sequence import animate as animate
-from .apps.animation.frames import Animation as Animation
 from .apps.atlas.seam_cuts import cut_open as cut_open
 from .apps.baking import BakeResult as BakeResult
 from .apps.baking import bake as bake
@@ -55,6 +53,8 @@ from .apps.image_warp import (
     warp_by_landmarks as warp_by_landmarks,
 )
 from .apps.inverse_map import InverseMap as InverseMap
+from .apps.mesh_motion.animation import Animation as Animation
+from .apps.mesh_motion.frame_sequence import animate as animate
 from .apps.mesh_motion.morph_result import MorphResult as MorphResult
 from .apps.mesh_motion.morphing import morph as morph
 from .apps.mesh_motion.moving_mesh import MovingMesh as MovingMesh

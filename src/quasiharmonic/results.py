@@ -5,7 +5,6 @@ Every result has ``success``, ``status``, ``message``, ``n_iterations``, ``secon
 """
 
 from quasiharmonic.apps.air_mesh import AirMeshState
-from quasiharmonic.apps.animation.frames import Animation, AnimationVerdict, FrameStep
 from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
 from quasiharmonic.apps.atlas.packing.pack import Packing
@@ -17,6 +16,7 @@ from quasiharmonic.apps.displacement_fields.voxels import InverseVolume, Inverti
 from quasiharmonic.apps.gradients.derivative import Derivative
 from quasiharmonic.apps.image_warp import WarpResult
 from quasiharmonic.apps.inverse_map import ChartInverse, SurfacePoints
+from quasiharmonic.apps.mesh_motion.animation import Animation, AnimationVerdict, FrameStep
 from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
 from quasiharmonic.apps.tetrahedra.certificate import TetrahedraCertificate
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult, TetrahedraStatus

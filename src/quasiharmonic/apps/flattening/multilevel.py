@@ -22,8 +22,8 @@ from itertools import islice
 import numpy as np
 
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.patches import LOWEST, smooth_map, thick_energy
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
+from quasiharmonic.apps.flattening.worst_triangles import LOWEST, smooth_map, thick_energy
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.coarsening.levels import coarsen

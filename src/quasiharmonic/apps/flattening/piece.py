@@ -11,11 +11,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.flattening.collapse import has_collapsed, thin_triangles
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
-from quasiharmonic.apps.flattening.patches import PatchDescents
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
+from quasiharmonic.apps.flattening.worst_triangles import PatchDescents, has_collapsed, thin_triangles
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet

@@ -1,4 +1,5 @@
-"""Motion of simulation meshes with their boundary: elements of three, four and six nodes.
+"""Meshes that follow their boundary: simulation meshes with elements of three, four and six nodes, and animations.
 
-The package builds on `energies` and `solver`. Start reading in `morphing`, then `moving_mesh` for many steps.
+The package builds on `energies` and `solver`. Start reading in `morphing`, then `moving_mesh` for many steps, and in
+`frame_sequence` for animations.
 """

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
-from quasiharmonic.apps.flattening.patches import descend_on_patches
 from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
+from quasiharmonic.apps.flattening.worst_triangles import descend_on_patches
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Deformation, Energy, Isotropic, SymmetricDirichlet
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet

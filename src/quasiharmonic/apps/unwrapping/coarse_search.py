@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.patches import mark_around
+from quasiharmonic.apps.flattening.worst_triangles import mark_around
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
 from quasiharmonic.energies.energies import SymmetricDirichlet

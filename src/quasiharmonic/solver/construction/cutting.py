@@ -19,8 +19,7 @@ import numpy as np
 
 from quasiharmonic.linsolve.laplacian import embed_tutte
 from quasiharmonic.problem import Problem
-from quasiharmonic.solver.construction.regions import Regions
-from quasiharmonic.solver.construction.sheet import Edge, Sheet
+from quasiharmonic.solver.construction.half_edges import Edge, Regions, Sheet
 from quasiharmonic.util.arrays import ComplexArray, invert_indices, to_complex
 from quasiharmonic.util.progress import heartbeat
 

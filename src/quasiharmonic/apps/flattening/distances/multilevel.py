@@ -29,8 +29,8 @@ from quasiharmonic.apps.flattening.multilevel import (
     flatten_levels,
     prolong_map,
 )
-from quasiharmonic.apps.flattening.patches import LOWEST, smooth_map, thick_energy
 from quasiharmonic.apps.flattening.piece import Piece, to_given_unit
+from quasiharmonic.apps.flattening.worst_triangles import LOWEST, smooth_map, thick_energy
 from quasiharmonic.energies.distances import SurfaceDistances, sample_distances
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from quasiharmonic.apps.animation.frames import Animation, FrameStep
+    from quasiharmonic.apps.mesh_motion.animation import Animation, FrameStep
     from quasiharmonic.io import MeshData
 
 PICTURES = ".gif", ".mp4"
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from quasiharmonic import io
-    from quasiharmonic.apps.animation.frame_sequence import animate
+    from quasiharmonic.apps.mesh_motion.frame_sequence import animate
     from quasiharmonic.geometry.mesh.topology import boundary_edges
     from quasiharmonic.problem import Problem
     from quasiharmonic.ui.plot.animation import check_animation, save_animation

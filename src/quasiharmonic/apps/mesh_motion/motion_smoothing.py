@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.animation.frames import find_longest
+from quasiharmonic.apps.mesh_motion.animation import find_longest
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, in_units
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent

@@ -1,4 +1,4 @@
-"""Result of an animation: its frames, and the displacement of vertices between them."""
+"""The result of an animation: its frames, and the displacement of vertices between them."""
 
 from __future__ import annotations
 

@@ -16,8 +16,8 @@ from typing import NamedTuple, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.animation.frames import Animation, FrameStep, check_targets, find_longest
-from quasiharmonic.apps.animation.motion_smoothing import MotionSmoothing
+from quasiharmonic.apps.mesh_motion.animation import Animation, FrameStep, check_targets, find_longest
+from quasiharmonic.apps.mesh_motion.motion_smoothing import MotionSmoothing
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify
