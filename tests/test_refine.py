@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, boundary_loops, certify, injective_map, io, solve
-from quasiharmonic.solver import refined_search as climbing
+from quasiharmonic.solver import refinement as climbing
 from quasiharmonic.solver.construction import constructing, cutting
 from quasiharmonic.solver.methods import Newton, RandomRestarts, VectorAdam
 from quasiharmonic.solver.search.stages import quick_stages, speed, without_restarts

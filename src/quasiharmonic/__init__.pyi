@@ -89,8 +89,8 @@ from .solver.mapping import injective_map as injective_map
 from .solver.mapping import quasi_harmonic_map as quasi_harmonic_map
 from .solver.mapping import solve as solve
 from .solver.methods import Descent as Descent
-from .solver.refining import refine as refine
-from .solver.refining import refine_problem as refine_problem
+from .solver.refinement import refine as refine
+from .solver.refinement import refine_problem as refine_problem
 from .solver.search.harmonising import harmonise as harmonise
 from .solver.search.many import injective_maps as injective_maps
 from .targets.cuts.find import crease_costs as crease_costs

@@ -33,7 +33,7 @@ from quasiharmonic.geometry.mesh.refinement import Refined
 from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction
 from quasiharmonic.problem.inspection import MeshReport
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Snapshot, Stage, Status, Step
-from quasiharmonic.solver.refining import RefinedProblem
+from quasiharmonic.solver.refinement import RefinedProblem
 
 __all__ = [
     "AirMeshState",

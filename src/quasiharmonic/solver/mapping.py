@@ -1,6 +1,6 @@
 """Map a mesh: `injective_map` from arrays, `solve` for a `Problem`, `quasi_harmonic_map` for given tensors.
 
-They check their arguments. The search itself is in `solver.search`, refinement in `solver.refined_search`.
+They check their arguments. The search itself is in `solver.search`, refinement in `solver.refinement`.
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ def solve_problem(problem: Problem, options: MapOptions) -> MapResult:
         problem = move_onto(options.slide, problem)
     if options.refine:
         # Import on demand: refinement also imports the construction and the diagnosis, which most maps do not need.
-        from quasiharmonic.solver.refined_search import on_refinement, search_refining
+        from quasiharmonic.solver.refinement import on_refinement, search_refining
 
         result = search_refining(problem, options)
         problem = on_refinement(problem, result.refined)

@@ -50,10 +50,8 @@ from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 from quasiharmonic.util.kernels import compiled
 
-#: Lower bound of the aim, in multiples of a triangle's size.
-MIN_AIM = 5.0
-#: Upper bound of the aim, in multiples of a triangle's size.
-MAX_AIM = 1000.0
+# Bounds of the aim, in multiples of a triangle's size.
+_MIN_AIM, _MAX_AIM = 5.0, 1000.0
 
 
 class ReweightedDirichlet(SymmetricDirichlet):
@@ -62,13 +60,13 @@ class ReweightedDirichlet(SymmetricDirichlet):
     ``aim`` > 1 is the maximum factor by which singular values should grow or shrink towards 1.
     """
 
-    def __init__(self, aim: float = MAX_AIM) -> None:
+    def __init__(self, aim: float = _MAX_AIM) -> None:
         self.aim = aim
 
     @classmethod
     def at(cls, mean: float) -> ReweightedDirichlet:
         """Return the energy whose aim is ``√mean``, that of a triangle with the mean energy, within bounds."""
-        return cls(min(max(mean**0.5, MIN_AIM), MAX_AIM))
+        return cls(min(max(mean**0.5, _MIN_AIM), _MAX_AIM))
 
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivative of ``½ Σ kᵢ ‖uᵢᵀ (J − σᵢ* R)‖²`` with constant uᵢ, σᵢ* and R.

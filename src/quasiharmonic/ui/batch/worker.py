@@ -35,7 +35,7 @@ from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve
-from quasiharmonic.solver.refined_search import on_refinement
+from quasiharmonic.solver.refinement import on_refinement
 from quasiharmonic.targets.boundary.fitting import FittedProblem
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record

@@ -111,7 +111,7 @@ def _map(
     from quasiharmonic.energies.polishing import smooth
     from quasiharmonic.problem.result import Status
     from quasiharmonic.solver.mapping import solve
-    from quasiharmonic.solver.refined_search import on_refinement
+    from quasiharmonic.solver.refinement import on_refinement
     from quasiharmonic.solver.search.stages import select_strategy
     from quasiharmonic.util.arrays import names_of
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from quasiharmonic.io import MeshData
     from quasiharmonic.problem import Problem
-    from quasiharmonic.solver.refining import RefinedProblem
+    from quasiharmonic.solver.refinement import RefinedProblem
 
 
 def declare_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     """Read, split, write, report."""
     from quasiharmonic import io
     from quasiharmonic.problem import Problem
-    from quasiharmonic.solver.refining import refine_problem
+    from quasiharmonic.solver.refinement import refine_problem
 
     output: Path = options.output
     if output.suffix.lower() != ".obj":
