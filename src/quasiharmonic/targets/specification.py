@@ -17,7 +17,7 @@ from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.curves.arcs import Arc
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
-from quasiharmonic.io.lowlevel.textual import read_pairs
+from quasiharmonic.io.untrusted import read_pairs
 from quasiharmonic.targets.outlines import shapes as outlines
 from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces
 from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter, word, word_curves

@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from quasiharmonic import __version__
+from quasiharmonic.io.atomic import new_folder, remove_file, write_whole, writing
 from quasiharmonic.io.errors import OutputError, check_path
-from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole, writing
 from quasiharmonic.ui.batch import places, records
 from quasiharmonic.ui.batch.dataset import DataSet, Stream, scratch_folder
 from quasiharmonic.ui.batch.pool import solve_in_processes

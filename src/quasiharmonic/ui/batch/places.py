@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from quasiharmonic.io.lowlevel.atomic import writing
+from quasiharmonic.io.atomic import writing
 from quasiharmonic.util.optional import explain_missing
 
 T = TypeVar("T")

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from quasiharmonic.io.lowlevel.atomic import writing
+from quasiharmonic.io.atomic import writing
 from quasiharmonic.ui.batch import places
 from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles, find_problems, list_lines
 from quasiharmonic.ui.batch.samples import Sample, is_archive, read_samples, results_name

@@ -12,9 +12,9 @@ from typing import Any
 
 from quasiharmonic.io import suffixes
 from quasiharmonic.io.mesh_files import INPUTS
+from quasiharmonic.io.untrusted import MAX_BYTES
 from quasiharmonic.ui.batch.records import load_pyarrow
 from quasiharmonic.ui.batch.tar_stream import Damage, open_tar, read_members
-from quasiharmonic.util.untrusted import MAX_BYTES
 
 #: Suffixes of archives.
 TAR = ".tar", ".tar.gz", ".tgz"

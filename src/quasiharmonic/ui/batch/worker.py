@@ -33,6 +33,7 @@ from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.refinement import Refined
 from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.io.untrusted import use_bound
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refine.attempts import on_refinement
@@ -42,7 +43,6 @@ from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.util.options import PolishOptions
 from quasiharmonic.util.threads import detach_input
-from quasiharmonic.util.untrusted import use_bound
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from quasiharmonic.io.lowlevel.atomic import writing
+from quasiharmonic.io.atomic import writing
 from quasiharmonic.ui.batch import places, records
 from quasiharmonic.ui.batch.problems import ProblemFiles
 from quasiharmonic.ui.batch.readers import ArchiveReader, FolderReader

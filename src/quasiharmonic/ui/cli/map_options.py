@@ -111,7 +111,7 @@ def read_edges(path: Path, n: int) -> NDArray[np.int64]:
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.lowlevel.textual import read_pairs
+    from quasiharmonic.io.untrusted import read_pairs
 
     rows = []
     for number, ends in read_pairs(path, "an edge"):

@@ -172,7 +172,7 @@ def save_picture(path: str | PathLike[str], figure: Figure) -> None:
     """
     from matplotlib import rc_context
 
-    from quasiharmonic.io.lowlevel.atomic import write_whole
+    from quasiharmonic.io.atomic import write_whole
 
     suffix = check_ending(path)
     # Equal figures give equal files: no date and no random identifiers.

@@ -28,7 +28,7 @@ def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLik
     written as a PNG, which needs no display. ImportError if polyscope is not installed, RuntimeError if no window can
     be opened, and ValueError as `quasiharmonic.distortion`.
     """
-    from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
+    from quasiharmonic.io.atomic import encode_by, write_whole
 
     polyscope = _polyscope()
     polyscope.set_verbosity(0)

@@ -180,7 +180,7 @@ def _mean_energy(mapped: MappedAtlas) -> float | None:
 def _weights(path: Path) -> list[float]:
     """Read one positive number per line."""
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.lowlevel.textual import read_rows
+    from quasiharmonic.io.untrusted import read_rows
 
     values = []
     for line, (value,) in read_rows(path, 1):
