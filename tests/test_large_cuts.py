@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import find_cuts, surfaces
-from quasiharmonic.geometry.coarsening.levels import coarsen
+from quasiharmonic.geometry.coarsening import coarsen
 from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.targets.cuts.graph import edge_graph

@@ -27,8 +27,8 @@ from quasiharmonic.util.arrays import (
     triangle_rows,
     vertex_array,
 )
-from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.optional import make_dataframe
+from quasiharmonic.util.hints import make_dataframe
+from quasiharmonic.util.outcome import Displayable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

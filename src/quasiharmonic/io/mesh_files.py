@@ -35,7 +35,7 @@ from quasiharmonic.util.arrays import (
     triangle_names,
     vertex_names,
 )
-from quasiharmonic.util.optional import with_extra
+from quasiharmonic.util.hints import with_extra
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshData:

@@ -34,7 +34,7 @@ from quasiharmonic.util.arrays import (
     to_points,
     triangle_rows,
 )
-from quasiharmonic.util.display import Displayable
+from quasiharmonic.util.outcome import Displayable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

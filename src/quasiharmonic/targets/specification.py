@@ -24,7 +24,7 @@ from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter, wo
 from quasiharmonic.targets.outlines.shapes import read_polylines
 from quasiharmonic.targets.outlines.svg import read_svg, svg_paths
 from quasiharmonic.util.arrays import FloatArray, check_numbers
-from quasiharmonic.util.spelling import suggest
+from quasiharmonic.util.hints import suggest
 
 _SHAPES = "disk", "ellipse:2x1", "rect:2x1", "polygon:6", "star:5", "ring:0.5", "letter:G", "word:QH"
 FORMS = f"{', '.join(_SHAPES)}, or a file .svg, .txt or .csv"

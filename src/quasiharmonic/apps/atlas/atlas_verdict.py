@@ -14,7 +14,7 @@ from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
 from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, names_of
-from quasiharmonic.util.optional import make_dataframe
+from quasiharmonic.util.hints import make_dataframe
 from quasiharmonic.util.outcome import Verdict
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from quasiharmonic.io.models.appearance import ImageUse, Wrap, to_linear
 from quasiharmonic.io.models.textures import Texture, texture_of
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 Bytes = NDArray[np.uint8]
 #: Longest side of an image that is read, in pixels.

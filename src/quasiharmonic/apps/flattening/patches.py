@@ -16,7 +16,7 @@ from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
-from quasiharmonic.geometry.coarsening.levels import has_marked_corner
+from quasiharmonic.geometry.coarsening import has_marked_corner
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
 # If patches cover more than this fraction of the surface, a step on the whole surface is better.

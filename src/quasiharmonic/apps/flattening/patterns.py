@@ -20,7 +20,7 @@ from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.problem.certification import certify
 from quasiharmonic.util.arrays import FloatArray, check_choice, check_non_negative, map_array
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 #: Millimetres per unit of the map.
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}

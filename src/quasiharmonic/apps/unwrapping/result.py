@@ -16,8 +16,7 @@ from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
 from quasiharmonic.io.adapters.objects import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, find_exponent, names_of
-from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import Displayable, Outcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -31,7 +31,7 @@ from quasiharmonic.util.arrays import (
     triangle_rows,
     vertex_array,
 )
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

@@ -26,7 +26,7 @@ from quasiharmonic.io.models.mesh_maps import check_mapped, in_plane, vertex_pla
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.untrusted import check_gifti, read_bytes, unpack_gzip
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 from quasiharmonic.util.progress import use_value
 
 # The intents that the standard has for points and triangles.

@@ -12,9 +12,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from quasiharmonic.geometry.coarsening.levels import coarsen
-from quasiharmonic.geometry.coarsening.prolongation import prolong
+from quasiharmonic.geometry.coarsening import coarsen
 from quasiharmonic.geometry.mesh.reference import rest_shapes
+from quasiharmonic.geometry.prolongation import prolong
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, mark, pad_to_space
 

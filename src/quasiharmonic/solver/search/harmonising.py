@@ -34,9 +34,9 @@ from quasiharmonic.util.arrays import (
     names_of,
     real_array,
 )
+from quasiharmonic.util.hints import suggest
 from quasiharmonic.util.options import HarmoniseOptions, takes
 from quasiharmonic.util.progress import reports_progress
-from quasiharmonic.util.spelling import suggest
 
 
 def _without_mesh(energy: Energy) -> Callable[[FloatArray, IntArray], Energy]:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from quasiharmonic.geometry.coarsening.levels import Removal
+from quasiharmonic.geometry.coarsening import Removal
 from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges, mark_sides, pair_keys
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from quasiharmonic.geometry.coarsening.levels import Removal, coarsen
+from quasiharmonic.geometry.coarsening import Removal, coarsen
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys, pair_keys
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph, triangles_near
 from quasiharmonic.targets.cuts.shortening import shorten_cuts

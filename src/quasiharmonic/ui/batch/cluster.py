@@ -11,7 +11,7 @@ from typing import Any
 from quasiharmonic.ui.batch.problems import MARKER, ProblemFiles
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.supervisor import Finished, Supervisor, record_crash
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 # Problems submitted per thread of the cluster: enough to keep threads busy, few to lose if the driver dies.
 _PER_THREAD = 3

@@ -35,7 +35,7 @@ from quasiharmonic.ui.batch.shards import (
 from quasiharmonic.ui.batch.supervisor import Finished, resident
 from quasiharmonic.ui.batch.writers import ArchiveWriter, FolderWriter
 from quasiharmonic.util.arrays import check_callback, check_instance, check_integer
-from quasiharmonic.util.optional import with_extra
+from quasiharmonic.util.hints import with_extra
 from quasiharmonic.util.threads import count_cores
 
 

@@ -21,7 +21,7 @@ from quasiharmonic.io.formats.obj import write_obj
 from quasiharmonic.io.formats.ply import write_ply
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.untrusted import parse_json
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 from quasiharmonic.util.options import MAP_FORMATS
 
 Record = dict[str, Any]

@@ -17,13 +17,12 @@ from quasiharmonic.io.registry import find_format
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
-from quasiharmonic.ui.studio.assets import bundle
+from quasiharmonic.ui.studio.page import bundle
 from quasiharmonic.ui.studio.protocol import Array, MessageFrame, ProtocolError, decode, encode
-from quasiharmonic.ui.studio.session.exports import mapped_model, write_model
-from quasiharmonic.ui.studio.session.session import Session
-from quasiharmonic.ui.studio.session.surface import PageSurface, make_sheet, read_sheet
+from quasiharmonic.ui.studio.session import Session, mapped_model, write_model
+from quasiharmonic.ui.studio.surface import PageSurface, make_sheet, read_sheet
 from quasiharmonic.util.arrays import IntArray, describe
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 with explain_missing("the widget needs anywidget", extra="notebook"):
     import anywidget

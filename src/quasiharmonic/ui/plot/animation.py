@@ -29,7 +29,7 @@ from quasiharmonic.ui.plot.canvas import (
     view,
 )
 from quasiharmonic.util.arrays import FloatArray, check_instance, check_integer, check_sequence, map_array
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -26,10 +26,10 @@ from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.reweighted import ReweightedDirichlet
-from quasiharmonic.geometry.coarsening.levels import has_marked_corner
-from quasiharmonic.geometry.coarsening.prolongation import are_positive
+from quasiharmonic.geometry.coarsening import has_marked_corner
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.reference import rest_frames, rest_shapes
+from quasiharmonic.geometry.prolongation import are_positive
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, to_points
 
 # Fraction of the way to the weighted mean of its neighbours that a vertex moves.

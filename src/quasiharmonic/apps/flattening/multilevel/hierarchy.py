@@ -1,12 +1,12 @@
 """Coarse meshes of a surface with coarse boundaries, and the prolongation of maps to finer meshes.
 
 Each boundary loop is filled by a fan around a new vertex, its *hub*. Boundary vertices then become interior vertices,
-and `quasiharmonic.geometry.coarsening.levels` can remove them like others. Hubs are kept, and get no new edges. Without
+and `quasiharmonic.geometry.coarsening` can remove them like others. Hubs are kept, and get no new edges. Without
 the hubs, a coarse mesh with coarse loops remains.
 
 Prolongation lays the ring of each removed vertex out flat around it by its rest angles and lengths. The affine map that
 fits the flat ring best to the ring's current positions also maps the vertex. If this inverts a triangle, the vertex
-gets the position that gives its triangles the best shape, as in `quasiharmonic.geometry.coarsening.prolongation`. This
+gets the position that gives its triangles the best shape, as in `quasiharmonic.geometry.prolongation`. This
 position is inside its ring and the coarse image.
 """
 
@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quasiharmonic.geometry.coarsening.levels import coarsen
-from quasiharmonic.geometry.coarsening.prolongation import reinsertion_positions
+from quasiharmonic.geometry.coarsening import coarsen
 from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.geometry.prolongation import reinsertion_positions
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, invert_indices, mark
 
 # Weight that keeps the affine map close to a similarity.

@@ -40,7 +40,7 @@ from quasiharmonic.ui.cli.arguments import (
     texture_size,
     weld,
 )
-from quasiharmonic.util.optional import with_extra
+from quasiharmonic.util.hints import with_extra
 from quasiharmonic.util.options import INSTANCES, BakeOptions, UnwrapOptions
 
 if TYPE_CHECKING:

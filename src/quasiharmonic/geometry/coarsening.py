@@ -12,7 +12,7 @@ around one vertex of the ring, the *apex*, fills the polygon:
         r₄ ───── r₅            r₄ ───── r₅
 
 An injective map of the mesh without the vertex always extends to the mesh with it. All of the ring is visible from
-the apex, so it is also visible from a position close to the apex (`prolongation`) [1]_.
+the apex, so it is also visible from a position close to the apex (`quasiharmonic.geometry.prolongation`) [1]_.
 So the coarse mesh poses the same problem with fewer unknowns, and a map of it extends to the fine mesh. However, the
 coarse mesh may have no injective map even if the fine mesh has one.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.targets import nearest_on_boundary
-from quasiharmonic.ui.studio.session.operations import (
+from quasiharmonic.ui.studio.operations import (
     as_it_is,
     fix_where_it_is,
     flatten_islands,
@@ -20,12 +20,11 @@ from quasiharmonic.ui.studio.session.operations import (
     map_to_outline,
     saved_start,
 )
-from quasiharmonic.ui.studio.session.outlines import make_outline
-from quasiharmonic.ui.studio.session.recipes import Recipe
-from quasiharmonic.ui.studio.session.state import IslandState, SessionState
-from quasiharmonic.ui.studio.session.surface import PageSurface
-from quasiharmonic.ui.studio.session.unwrapping import unwrap_model
-from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.ui.studio.recipes import Recipe
+from quasiharmonic.ui.studio.state import IslandState, SessionState
+from quasiharmonic.ui.studio.surface import PageSurface
+from quasiharmonic.ui.studio.unwrapping import unwrap_model
+from quasiharmonic.ui.studio.validation import RequestError, make_outline
 from quasiharmonic.util.arrays import FloatArray
 
 _FIRST_OUTLINE = "rect:1x1"

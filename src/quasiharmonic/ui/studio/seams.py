@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.apps.unwrapping.symmetry import find_mirror
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components, pair_keys
-from quasiharmonic.ui.studio.session.state import SessionState
-from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.ui.studio.state import SessionState
+from quasiharmonic.ui.studio.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray, IntArray, pad_to_space
 
 

@@ -13,13 +13,13 @@ from quasiharmonic.apps.unwrapping.result import UnwrapStatus, UnwrapStep
 from quasiharmonic.apps.unwrapping.unwrap import unwrap
 from quasiharmonic.io import read_mesh
 from quasiharmonic.io.seamed_mesh import SeamedMesh
-from quasiharmonic.ui.studio.offered import NAMES
+from quasiharmonic.ui.studio import recipes
+from quasiharmonic.ui.studio.operations import as_it_is, make_start, saved_start
+from quasiharmonic.ui.studio.page import NAMES
 from quasiharmonic.ui.studio.protocol import MessageFrame
-from quasiharmonic.ui.studio.session import recipes
-from quasiharmonic.ui.studio.session.operations import as_it_is, make_start, saved_start
-from quasiharmonic.ui.studio.session.recipes import FACES, FORBIDDEN, SEAMS, Code, Given, Script, Source, public
-from quasiharmonic.ui.studio.session.state import SessionState
-from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.ui.studio.recipes import FACES, FORBIDDEN, SEAMS, Code, Given, Script, Source, public
+from quasiharmonic.ui.studio.state import SessionState
+from quasiharmonic.ui.studio.validation import RequestError
 from quasiharmonic.util.options import UnwrapOptions
 
 # Keywords of the statements that divide an OBJ file into parts.

@@ -1,11 +1,17 @@
-"""Static files of the page, read only from the package."""
+"""The contents of the page: its static files, read only from the package, and the options of `unwrap` that it offers.
+
+The options have the defaults, choices and explanations of `UnwrapOptions`.
+"""
 
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 from functools import cache
 from importlib.resources import files
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from quasiharmonic.util.options import UnwrapOptions
 
 _KINDS = {
     "html": "text/html; charset=utf-8",
@@ -15,6 +21,18 @@ _KINDS = {
 }
 _IMPORT = re.compile(r'^import (\{[^}]*\}) from "\./(\w+)\.js";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
+
+# Explanations of the options that the command line explains itself, because files have a part in them.
+_TEXTS = {
+    "hard_edges": "seams at all edges with a larger angle between the normals, in degrees, as normal maps need them",
+    "labels": "parts of the file, between which seams cost almost nothing",
+}
+_CHOICES = {"labels": ("groups", "materials")}
+#: Names of the options, in the order of the page.
+NAMES = (
+    *("max_stretch", "max_charts", "symmetry", "hard_edges", "labels", "straighten", "up"),
+    *("divide_for_packing", "texels_per_unit"),
+)
 
 
 class Asset(NamedTuple):
@@ -54,3 +72,17 @@ def bundle(name: str) -> str:
 
     exported = wrap(name)
     return "\n".join([*wrapped.values(), f"export const {{ {', '.join(exported)} }} = qhm_{name};\n"])
+
+
+def offered_options() -> list[dict[str, Any]]:
+    """Return name, explanation, default and choices of each option; a switch has the default False."""
+    known = {one.name: one for one in fields(UnwrapOptions)}
+    return [
+        {
+            "name": name,
+            "help": (known[name].metadata["help"] or _TEXTS[name]).replace("%%", "%"),
+            "default": known[name].default,
+            "choices": known[name].metadata["choices"] or _CHOICES.get(name, ()),
+        }
+        for name in NAMES
+    ]

@@ -9,12 +9,12 @@ import numpy as np
 from quasiharmonic.apps.atlas import island_functions as atlas
 from quasiharmonic.apps.atlas.atlas_verdict import MIRROR
 from quasiharmonic.geometry.mesh.topology import label_components
-from quasiharmonic.ui.studio.session import recipes
-from quasiharmonic.ui.studio.session.operations import as_it_is, find_source, require_map, saved_start
-from quasiharmonic.ui.studio.session.recipes import public
-from quasiharmonic.ui.studio.session.seams import find_chain, pair_sides
-from quasiharmonic.ui.studio.session.state import SessionState
-from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.ui.studio import recipes
+from quasiharmonic.ui.studio.operations import as_it_is, find_source, require_map, saved_start
+from quasiharmonic.ui.studio.recipes import public
+from quasiharmonic.ui.studio.seams import find_chain, pair_sides
+from quasiharmonic.ui.studio.state import SessionState
+from quasiharmonic.ui.studio.validation import RequestError
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 

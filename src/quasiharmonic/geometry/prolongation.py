@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.geometry.coarsening.levels import Coarsening
+from quasiharmonic.geometry.coarsening import Coarsening
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.progress import heartbeat

@@ -18,9 +18,9 @@ from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui.studio.protocol import Array
-from quasiharmonic.ui.studio.session.outlines import Outline
-from quasiharmonic.ui.studio.session.recipes import Recipe
-from quasiharmonic.ui.studio.session.surface import PageSurface
+from quasiharmonic.ui.studio.recipes import Recipe
+from quasiharmonic.ui.studio.surface import PageSurface
+from quasiharmonic.ui.studio.validation import Outline
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 

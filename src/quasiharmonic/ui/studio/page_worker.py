@@ -15,10 +15,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from quasiharmonic.ui.studio.history import Storage
 from quasiharmonic.ui.studio.protocol import Array, MessageFrame, decode, encode
-from quasiharmonic.ui.studio.session.history import Storage
-from quasiharmonic.ui.studio.session.session import Session
-from quasiharmonic.ui.studio.session.surface import read_sheet
+from quasiharmonic.ui.studio.session import Session
+from quasiharmonic.ui.studio.surface import read_sheet
 from quasiharmonic.util.threads import detach_input
 
 #: Maximum total size of waiting messages, bytes.

@@ -15,7 +15,7 @@ from quasiharmonic.apps.unwrapping.model_files import divide_polygons
 from quasiharmonic.geometry.surfaces import cat
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem.inspection import MeshReport, inspect_mesh
-from quasiharmonic.ui.studio.session.validation import stored_file
+from quasiharmonic.ui.studio.validation import stored_file
 from quasiharmonic.util.arrays import IntArray
 
 #: Maximum number of triangles; larger meshes are too slow to draw and drag.

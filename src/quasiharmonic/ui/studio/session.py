@@ -1,22 +1,24 @@
-"""Session of a page: handle its messages and send updates.
+"""Session of a page: handle its messages, send updates, and make the files that it saves.
 
 The module is independent of sockets and processes. The caller passes in messages and transmits the updates.
 """
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from quasiharmonic import io
 from quasiharmonic.io.models.textures import texture_of
+from quasiharmonic.ui.studio import layout, operations, validation
+from quasiharmonic.ui.studio.drag import Follower, drag_weights
 from quasiharmonic.ui.studio.protocol import MessageFrame
-from quasiharmonic.ui.studio.session import layout, operations, validation
-from quasiharmonic.ui.studio.session.drag import Follower, drag_weights
-from quasiharmonic.ui.studio.session.exports import list_files
-from quasiharmonic.ui.studio.session.outlines import Outline, make_outline, make_polygon, read_drawing
-from quasiharmonic.ui.studio.session.seams import (
+from quasiharmonic.ui.studio.recipes import MAP, START
+from quasiharmonic.ui.studio.seams import (
     add_edges,
     add_mirrored,
     find_chain,
@@ -24,7 +26,7 @@ from quasiharmonic.ui.studio.session.seams import (
     remove_edges,
     shortest_path,
 )
-from quasiharmonic.ui.studio.session.setup import (
+from quasiharmonic.ui.studio.setup import (
     make_first_state,
     open_without_map,
     pin_vertices,
@@ -32,14 +34,17 @@ from quasiharmonic.ui.studio.session.setup import (
     with_corner,
     with_start,
 )
-from quasiharmonic.ui.studio.session.surface import PageSurface, make_first_sheet, read_upload
-from quasiharmonic.ui.studio.session.unwrapping import read_options, unwrap_model
-from quasiharmonic.ui.studio.session.updates import DragState, PageUpdates
-from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.ui.studio.state import SessionState
+from quasiharmonic.ui.studio.surface import PageSurface, make_first_sheet, read_upload
+from quasiharmonic.ui.studio.unwrapping import read_options, unwrap_model
+from quasiharmonic.ui.studio.updates import DragState, PageUpdates
+from quasiharmonic.ui.studio.validation import Outline, RequestError, make_outline, make_polygon, read_drawing
 from quasiharmonic.util.arrays import IntArray
 from quasiharmonic.util.options import ENERGIES
 
 _LARGEST_TEXTURE = 16_384
+#: Formats in which the page saves the map.
+FORMATS = "obj", "glb", "ply"
 
 
 class Session(PageUpdates):
@@ -349,3 +354,41 @@ def _read_size(frame: MessageFrame, resolution: int) -> dict[str, Any]:
         "resolution": int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, resolution)),
         "padding": float(validation.amount(frame, "padding", 0, 64, 4)),
     }
+
+
+def list_files(state: SessionState, form: str, texture: io.Texture | None) -> dict[str, bytes]:
+    """Return the files of a map by name: the model with its map, and its image.
+
+    In OBJ, also those that the command and the script read. RequestError if there is no map.
+    """
+    if form not in FORMATS:
+        raise RequestError(f"unknown format {form[:20]!r}: use {', '.join(FORMATS)}")
+    mesh = mapped_model(state, None if form == "ply" else texture)
+    files = _write(mesh, MAP if form == "obj" else f"map.{form}")
+    if form == "obj":
+        recipe = state.recipe
+        files |= recipe.texts | ({} if recipe.start is None else _write(recipe.start, START))
+    return files
+
+
+def mapped_model(state: SessionState, texture: io.Texture | None) -> io.MeshData:
+    """Return the file's mesh with the map of a state and an image; RequestError if there is no map."""
+    if state.mesh.uv is None:
+        raise RequestError("there is no map to save yet: press Unwrap or Flatten first")
+    mesh = state.sheet.mesh if state.recipe.of_file else state.sheet.mapped_file(state.mesh)
+    return mesh if texture is None else replace(mesh, texture=texture)
+
+
+def write_model(path: Path, mesh: io.MeshData) -> None:
+    """Write a mesh in the format of the suffix; without a map as OBJ."""
+    if mesh.FT is None:
+        io.write_obj(path, mesh)
+    else:
+        io.write_mapped(path, mesh)
+
+
+def _write(mesh: io.MeshData, name: str) -> dict[str, bytes]:
+    """Return a mesh as a file, with the files that belong to it."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_model(Path(folder) / name, mesh)
+        return {each.name: each.read_bytes() for each in sorted(Path(folder).iterdir())}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from quasiharmonic.io.models.textures import Texture
-from quasiharmonic.ui.studio.session.state import SessionState
+from quasiharmonic.ui.studio.state import SessionState
 
 #: Maximum number of states for undo.
 MAX_STATES = 40

@@ -25,8 +25,7 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.http11 import Request, Response
 
 from quasiharmonic.ui.batch.supervisor import resident
-from quasiharmonic.ui.studio.assets import assets
-from quasiharmonic.ui.studio.offered import offered_options
+from quasiharmonic.ui.studio.page import assets, offered_options
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
 from quasiharmonic.util.options import ENERGY_LABELS
 
@@ -42,7 +41,7 @@ _SESSION = re.compile(r"[0-9a-f]{32}")
 #: Close code of a socket if too many pages are open.
 TRY_LATER = 1013
 # Code of the worker process; -P prevents imports from the working directory.
-_CODE = "import sys; from quasiharmonic.ui.studio.server.page_worker import serve; serve(*sys.argv[1:])"
+_CODE = "import sys; from quasiharmonic.ui.studio.page_worker import serve; serve(*sys.argv[1:])"
 #: Memory limit of one page, bytes.
 MAX_MEMORY = 6 << 30
 # Seconds between two checks, and seconds until a process must react to "stop".

@@ -1,13 +1,24 @@
-"""Optional packages: import errors that say what to install, and pandas for results as DataFrames."""
+"""Hints of errors: which name a user may have meant, and which package to install.
+
+Also results as DataFrames of pandas, an optional package.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+
+def suggest(given: object, known: Iterable[str]) -> str:
+    """Return "; did you mean ...?" with the known name that is nearest to a given one; empty if none is near."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(given, list(known), n=1) if isinstance(given, str) else []
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 @contextmanager

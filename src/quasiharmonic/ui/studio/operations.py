@@ -29,14 +29,13 @@ from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.targets import filled, outline_curves
+from quasiharmonic.targets.boundary.boundary_to import find_corner_vertices, fit_boundary, fix_in_place
 from quasiharmonic.targets.boundary.corner_pins import CornerSpec
-from quasiharmonic.targets.boundary.fitting import find_corner_vertices, fit_boundary, fix_in_place
 from quasiharmonic.targets.cuts.find import find_cuts
-from quasiharmonic.ui.studio.session import recipes
-from quasiharmonic.ui.studio.session.outlines import Outline
-from quasiharmonic.ui.studio.session.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Script, Source, public
-from quasiharmonic.ui.studio.session.state import IslandState, SessionState
-from quasiharmonic.ui.studio.session.validation import RequestError
+from quasiharmonic.ui.studio import recipes
+from quasiharmonic.ui.studio.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Script, Source, public
+from quasiharmonic.ui.studio.state import IslandState, SessionState
+from quasiharmonic.ui.studio.validation import Outline, RequestError
 from quasiharmonic.util.arrays import IntArray
 
 Callback = Callable[[Step], object] | None
