@@ -1,4 +1,7 @@
-"""Figures of distortion: a surface and its map coloured by a measure, and an area-weighted histogram."""
+"""Figures of distortion: a surface and its map coloured by a measure, with an area-weighted histogram.
+
+Also a displacement field: the mapped grid, coloured by the change of area of each cell.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.displacement_fields.grid import Grid, check_field
+from quasiharmonic.apps.displacement_fields.nearest import fold_free
 from quasiharmonic.energies.measures import Distortion, distortion
 from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import (
@@ -16,6 +21,8 @@ from quasiharmonic.ui.plot.canvas import (
     RED,
     as_mesh,
     caption,
+    fill,
+    fit,
     name_axes,
     new_figure,
     paint_map,
@@ -24,13 +31,12 @@ from quasiharmonic.ui.plot.canvas import (
     shade,
     view,
 )
-from quasiharmonic.util.arrays import FloatArray, check_choice, map_array
+from quasiharmonic.util.arrays import FloatArray, check_choice, count_of, map_array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
-
 
 _GREY = (0.6, 0.6, 0.6)  # triangles without a value
 
@@ -209,3 +215,56 @@ def _histogram(ax: Axes, found: Distortion, measure: str, values: FloatArray, sc
     name_axes(ax, scale.label, "% of the surface's area")
     summed = found.statistics(measure)
     caption(ax, f"median {summed.median:.3g}, 95 % < {summed.p95:.3g}, max {summed.maximum:.3g}")
+
+
+def plot_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> Figure:
+    """Draw the cells of a displacement field before and after, coloured by area ratio, folded cells in red.
+
+    Parameters
+    ----------
+    field : (h, w, 2) or (d, h, w, 3) array
+        Displacements; see `quasiharmonic.nearest_invertible`. Of a field on voxels, the slice with the most folded
+        cells is drawn, as seen along z.
+    spacing : float, (float, float) or (float, float, float)
+        Distance between neighbouring pixels, along x, along y, and along z.
+
+    Returns
+    -------
+    matplotlib Figure
+
+    Raises
+    ------
+    ValueError
+        If the field has the wrong shape or is not finite, or the spacing is not positive.
+    """
+    given = check_field(field)
+    folded = ~fold_free(given, spacing=spacing)
+    grid = Grid(given.shape[:-1], spacing)
+    mapped, rest = grid.positions(given), grid.points
+    folds, where = int(folded.sum()), ""
+    if given.ndim == 4:
+        layer = int(folded.sum(axis=(1, 2)).argmax())
+        mapped, rest, folded, where = mapped[layer], rest[layer], folded[layer], f", slice {layer}"
+    # Rows run downwards.
+    before, after = (
+        np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)[..., :2].reshape(-1, 4, 2) * [1, -1]
+        for p in (rest, mapped)
+    )
+    diagonals = after[:, 2:] - after[:, :2]
+    ratio = (diagonals[:, 1, 0] * diagonals[:, 0, 1] - diagonals[:, 1, 1] * diagonals[:, 0, 0]) / 2
+    ratio /= grid.spacing[0] * grid.spacing[1]
+    bad = folded.ravel()
+    usable = ratio[~bad & (ratio > 0)]
+    usable = usable if usable.size else np.ones(1)
+    scale = choose_scale("area_ratio", usable, np.ones(len(usable)))
+    colors = np.where(bad[:, None], RED, scale.colors(np.where(ratio > 0, ratio, np.nan)))
+    order = np.argsort(bad, kind="stable")
+    figure = new_figure((10.4, 4.8))
+    for k, cells in enumerate((before, after)):
+        ax = figure.add_axes((0.005 + 0.45 * k, 0.02, 0.44, 0.88))
+        width = float(np.clip(fit(ax, cells.reshape(-1, 2)) * grid.spacing[:2].min() / 30, 0.05, 0.6))
+        fill(ax, cells[order], colors[order], [(*INK, 0.6)], width)
+    caption(figure.axes[0], f"field{where}: {count_of('cell', 'cells', folds)} folded", RED if folds else INK)
+    caption(figure.axes[1], "mapped grid, coloured by area ratio")
+    draw_bar(figure, scale, (0.925, 0.14, 0.012, 0.74))
+    return figure
