@@ -27,7 +27,7 @@ from quasiharmonic.energies.newton.sliding_boundary import SlidingModel, move_bo
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.reference import rest_shapes
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run, run_within

@@ -1,6 +1,5 @@
 # The public names. `__init__.py` imports each when it is first used.
 
-from .adapters.objects import write_map as write_map
 from .atomic import check_writable as check_writable
 from .atomic import new_folder as new_folder
 from .atomic import no_remains as no_remains
@@ -54,6 +53,7 @@ from .models.meshdata import refined_mesh as refined_mesh
 from .models.textures import Texture as Texture
 from .models.textures import checkerboard as checkerboard
 from .models.textures import read_texture as read_texture
+from .objects import write_map as write_map
 from .registry import FORMATS as FORMATS
 from .registry import Format as Format
 from .registry import find_format as find_format

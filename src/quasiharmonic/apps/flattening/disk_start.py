@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.splitting import make_fans
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import FloatArray, IntArray

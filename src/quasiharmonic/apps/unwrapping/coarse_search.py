@@ -25,8 +25,8 @@ from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.geometry.coarsening import Removal, has_marked_corner
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
-from quasiharmonic.geometry.mesh.fans import split_parts
 from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.splitting import split_parts
 from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian

@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.fans import weld_points
+from quasiharmonic.geometry.mesh.splitting import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.untrusted import read_bytes

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
-from quasiharmonic.geometry.mesh.refinement import Refined, compose, split_edges
+from quasiharmonic.geometry.mesh.splitting import Refined, compose, split_edges
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Stage, Status

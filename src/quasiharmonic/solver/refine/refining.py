@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.refinement import Refined, compose, split_edges
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.geometry.mesh.splitting import Refined, compose, split_edges
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
 from quasiharmonic.util.arrays import check_integer

@@ -19,7 +19,7 @@ from quasiharmonic.energies.energies import ARAP, AreaPreserving, Energy, Unsign
 from quasiharmonic.energies.springs import MassSpring
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
 from quasiharmonic.geometry.exact.loops import check_loops, join_items
-from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.geometry.mesh.reference import Reference
+from quasiharmonic.geometry.mesh.splitting import make_fans
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.io.seamed_mesh import Island
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain, Problem

@@ -30,7 +30,7 @@ from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, each_island, merg
 from quasiharmonic.apps.flattening.free_boundary import check_flattenable
 from quasiharmonic.energies.polishing import polish_result
 from quasiharmonic.geometry.curves import BoundaryCurves
-from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.io.untrusted import use_bound

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.io import MeshData, Texture, read_texture
-from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, stands_for_mesh
+from quasiharmonic.io.objects import MeshLike, mesh_arrays, stands_for_mesh
 from quasiharmonic.io.registry import find_format
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem import Problem

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.io.adapters.accepts_mesh import writer_accepts_mesh
+from quasiharmonic.io.accepts_mesh import writer_accepts_mesh
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.problem.result import MapResult, Step
 from quasiharmonic.ui.plot.canvas import (

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.apps.displacement_fields.grid import Grid, check_field
 from quasiharmonic.apps.displacement_fields.nearest import fold_free
 from quasiharmonic.energies.measures import Distortion, distortion
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import (
     INK,
     RED,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.ui.plot.canvas import RED, as_mesh
 from quasiharmonic.util.arrays import FloatArray, map_array, pad_to_space
 from quasiharmonic.util.hints import explain_missing

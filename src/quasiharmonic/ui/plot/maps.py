@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.ui.plot.canvas import (
     BORDER,
     INK,

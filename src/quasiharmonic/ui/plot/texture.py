@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.topology import boundary_edges, components
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.io.errors import check_path, report_damage
 from quasiharmonic.io.models.textures import Texture, read_texture
 from quasiharmonic.ui.plot.canvas import (

@@ -22,7 +22,7 @@ from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edges, trace_loops
 from quasiharmonic.io import MeshData, read_mesh
-from quasiharmonic.io.adapters.objects import as_seamed_mesh
+from quasiharmonic.io.objects import as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import diagnose

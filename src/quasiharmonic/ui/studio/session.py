@@ -14,18 +14,22 @@ import numpy as np
 
 from quasiharmonic import io
 from quasiharmonic.io.models.textures import texture_of
-from quasiharmonic.ui.studio import layout, operations, validation
+from quasiharmonic.ui.studio import operations, validation
 from quasiharmonic.ui.studio.drag import Follower, drag_weights
-from quasiharmonic.ui.studio.protocol import MessageFrame
-from quasiharmonic.ui.studio.recipes import MAP, START
-from quasiharmonic.ui.studio.seams import (
+from quasiharmonic.ui.studio.islands import (
     add_edges,
     add_mirrored,
     find_chain,
     find_seams,
+    move_islands,
+    pack_all,
     remove_edges,
     shortest_path,
+    stitch_seam,
+    weld_seams,
 )
+from quasiharmonic.ui.studio.protocol import MessageFrame
+from quasiharmonic.ui.studio.recipes import MAP, START
 from quasiharmonic.ui.studio.setup import (
     make_first_state,
     open_without_map,
@@ -162,12 +166,12 @@ class Session(PageUpdates):
     def _do_stitch(self, frame: MessageFrame) -> None:
         self._refuse_drawn()
         operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
-        self._keep(layout.stitch_seam(self.state, self._model_vertex(frame, "vertex")), fit=True)
+        self._keep(stitch_seam(self.state, self._model_vertex(frame, "vertex")), fit=True)
 
     def _do_weld(self, frame: MessageFrame) -> None:
         self._refuse_drawn()
         operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
-        self._keep(layout.weld_seams(self.state, 1 / _read_size(frame, 2048)["resolution"]))
+        self._keep(weld_seams(self.state, 1 / _read_size(frame, 2048)["resolution"]))
 
     def _do_repair(self, frame: MessageFrame) -> None:
         self._refuse_drawn()
@@ -228,14 +232,14 @@ class Session(PageUpdates):
         # The page has already moved them.
         self._tell_busy("moving the islands")
         self._refuse_drawn()
-        self._keep(layout.move_islands(self.state, by, turn, scale, mirror, texels))
+        self._keep(move_islands(self.state, by, turn, scale, mirror, texels))
 
     def _do_pack(self, frame: MessageFrame) -> None:
         self._refuse_drawn()
         operations.require_injective(replace(self.state, selected=tuple(range(len(self.state.islands)))))
         size = _read_size(frame, 1024)
         self._tell_busy("packing")
-        self._keep(layout.pack_all(self.state, **size), fit=True)
+        self._keep(pack_all(self.state, **size), fit=True)
 
     def _do_polish(self, frame: MessageFrame) -> None:
         energy, slide = validation.text(frame, "energy"), frame.header.get("slide") is True

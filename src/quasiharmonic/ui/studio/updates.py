@@ -11,8 +11,8 @@ import numpy as np
 from quasiharmonic.io.models.textures import Texture
 from quasiharmonic.ui.studio.drag import DragMap, Follower
 from quasiharmonic.ui.studio.history import History, Storage
+from quasiharmonic.ui.studio.islands import find_seams, sides_of
 from quasiharmonic.ui.studio.protocol import Array
-from quasiharmonic.ui.studio.seams import find_seams, sides_of
 from quasiharmonic.ui.studio.state import (
     DistortionMonitor,
     Numbering,

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quasiharmonic.geometry.coarsening import coarsen
-from quasiharmonic.geometry.mesh.fans import make_fans
+from quasiharmonic.geometry.mesh.splitting import make_fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.geometry.prolongation import reinsertion_positions
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, invert_indices, mark

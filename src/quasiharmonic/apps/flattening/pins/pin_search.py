@@ -29,7 +29,7 @@ from quasiharmonic.apps.flattening.pins.obstructions import pin_obstructions
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify
-from quasiharmonic.geometry.mesh.refinement import split_edges
+from quasiharmonic.geometry.mesh.splitting import split_edges
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis, Kind

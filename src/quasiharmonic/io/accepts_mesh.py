@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.elements import join_elements, split_solids
-from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, planar_arrays, stands_for_mesh, without_constant_z
 from quasiharmonic.io.fem.files import read_fem, read_volume
+from quasiharmonic.io.objects import MeshLike, mesh_arrays, planar_arrays, stands_for_mesh, without_constant_z
 from quasiharmonic.io.registry import FilePath, suffixes
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe, index_array, vertex_array
 
