@@ -23,8 +23,8 @@ from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui import plot
 from quasiharmonic.ui.plot.canvas import RED, caption, new_figure, png_bytes, verdict
-from quasiharmonic.ui.plot.elements import cut_tetrahedra, elements_figure, outline_elements
 from quasiharmonic.ui.plot.maps import map_figure
+from quasiharmonic.ui.plot.measures import cut_tetrahedra, elements_figure, outline_elements
 from quasiharmonic.util.outcome import Displayable
 
 if TYPE_CHECKING:

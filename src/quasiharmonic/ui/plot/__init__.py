@@ -4,7 +4,6 @@ The package builds on `geometry` and `problem`. Start reading in `canvas`, then 
 """
 
 from quasiharmonic.ui.plot.animation import plot_convergence, save_animation, save_figures
-from quasiharmonic.ui.plot.distortion import plot_distortion, plot_field, save_distortion_figure
 from quasiharmonic.ui.plot.maps import (
     plot_before_after,
     plot_map,
@@ -13,6 +12,7 @@ from quasiharmonic.ui.plot.maps import (
     save_boundary_figure,
     save_map_figure,
 )
+from quasiharmonic.ui.plot.measures import plot_distortion, plot_field, save_distortion_figure
 from quasiharmonic.ui.plot.texture import plot_texture, plot_unwrap, save_texture_figure
 
 __all__ = [

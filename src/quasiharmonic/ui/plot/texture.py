@@ -34,7 +34,7 @@ from quasiharmonic.ui.plot.canvas import (
     verdict,
     view,
 )
-from quasiharmonic.ui.plot.distortion import choose_scale, draw_bar
+from quasiharmonic.ui.plot.measures import choose_scale, draw_bar
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, enumerate_each, map_array
 from quasiharmonic.util.hints import explain_missing
 

@@ -34,13 +34,14 @@ from quasiharmonic.ui.studio.setup import (
     make_first_state,
     open_without_map,
     pin_vertices,
+    read_options,
     turn_over,
+    unwrap_model,
     with_corner,
     with_start,
 )
 from quasiharmonic.ui.studio.state import SessionState
 from quasiharmonic.ui.studio.surface import PageSurface, make_first_sheet, read_upload
-from quasiharmonic.ui.studio.unwrapping import read_options, unwrap_model
 from quasiharmonic.ui.studio.updates import DragState, PageUpdates
 from quasiharmonic.ui.studio.validation import Outline, RequestError, make_outline, make_polygon, read_drawing
 from quasiharmonic.util.arrays import IntArray
