@@ -27,9 +27,9 @@ from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.shards import Shard
 from quasiharmonic.ui.batch.tar_stream import Damage, open_tar, read_members
 
-#: Suffixes of archives.
-TAR = ".tar", ".tar.gz", ".tgz"
-PARQUET = ".parquet"
+# Suffixes of archives.
+_TAR = ".tar", ".tar.gz", ".tgz"
+_PARQUET = ".parquet"
 #: Columns of a Parquet file with the names of its problems; the first that exists counts.
 KEYS = "__key__", "problem", "name"
 # Extensions of the list of fixed vertices.
@@ -76,12 +76,12 @@ class Sample:
 
 def is_archive(name: str) -> bool:
     """Whether the name is that of an archive."""
-    return name.lower().endswith((*TAR, PARQUET))
+    return name.lower().endswith((*_TAR, _PARQUET))
 
 
 def is_parquet(path: str | os.PathLike[str]) -> bool:
     """Whether a path or URL is that of a Parquet file."""
-    return os.fspath(path).lower().endswith(PARQUET)
+    return os.fspath(path).lower().endswith(_PARQUET)
 
 
 def results_name(name: str) -> str:

@@ -94,16 +94,16 @@ def plot_texture(
     color: Callable[[FloatArray], FloatArray]
     if texture is None:
         low, size = uv.min(axis=0), float(np.ptp(uv, axis=0).max()) or 1.0
-        board, color = (uv - low) / size * squares, checkerboard_color
+        board, color = (uv - low) / size * squares, _checkerboard_color
     else:
         board, color = uv, _make_image_color(texture)
     inverted = find_not_positive(F, uv)
     seen = view(rest, F)
     figure = new_figure((9.6, 4.8))
     surface, plane = panels(figure, 2)
-    show_render(surface, seen.points, render(seen.points, seen.depth, F, board, color, inverted, seen.light))
+    _show_render(surface, seen.points, render(seen.points, seen.depth, F, board, color, inverted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
-    show_render(plane, board, render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
+    _show_render(plane, board, render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
     draw_edges(plane, board, boundary_edges(F, len(board)))
     verdict(plane, "map", len(inverted))
     return figure
@@ -138,7 +138,7 @@ def save_texture_figure(
     save_picture(path, plot_texture(V, F, uv, squares=squares, texture=texture))
 
 
-def show_render(ax: Axes, points: FloatArray, image: FloatArray) -> None:
+def _show_render(ax: Axes, points: FloatArray, image: FloatArray) -> None:
     """Show a rendered image in axes, in the coordinates of its points."""
     low, high = _window(points)
     ax.imshow(image, interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
@@ -193,7 +193,7 @@ def render(
     return np.concatenate([shown, cover[..., None] / _SAMPLES**2], axis=2)
 
 
-def checkerboard_color(coordinates: FloatArray) -> FloatArray:
+def _checkerboard_color(coordinates: FloatArray) -> FloatArray:
     """Return the colours (k, 3) of a checkerboard whose squares have side 1."""
     column, row = np.floor(coordinates).T
     half = (column + row) / 2
@@ -302,10 +302,10 @@ def plot_unwrap(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Figure:
 
     paint_map(layout, F, uv, colormaps["viridis"](chart[F[:, 0]] * 0.618 % 1)[:, :3], bad)
     verdict(layout, f"{len(first)} charts" if len(first) > 1 else "1 chart", len(bad))
-    show_render(
+    _show_render(
         board,
         seen.points,
-        render(seen.points, seen.depth, F, uv * _SQUARES, checkerboard_color, bad, seen.light),
+        render(seen.points, seen.depth, F, uv * _SQUARES, _checkerboard_color, bad, seen.light),
     )
     caption(board, "checkerboard")
     density = np.sqrt(np.where(found.area_ratio > 0, found.area_ratio, np.nan))

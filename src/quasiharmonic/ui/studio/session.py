@@ -345,7 +345,7 @@ class Session(PageUpdates):
 
     def _do_save(self, frame: MessageFrame) -> None:
         form = frame.header.get("format", "obj")
-        files = list_files(self.state, form if isinstance(form, str) else "", self._history.texture)
+        files = _list_files(self.state, form if isinstance(form, str) else "", self._history.texture)
         for name, content in files.items():
             self._tell({"kind": "file", "name": name}, {"content": np.frombuffer(content, dtype=np.uint8)})
         self._history.mark_saved()
@@ -361,7 +361,7 @@ def _read_size(frame: MessageFrame, resolution: int) -> dict[str, Any]:
     }
 
 
-def list_files(state: SessionState, form: str, texture: io.Texture | None) -> dict[str, bytes]:
+def _list_files(state: SessionState, form: str, texture: io.Texture | None) -> dict[str, bytes]:
     """Return the files of a map by name: the model with its map, and its image.
 
     In OBJ, also those that the command and the script read. RequestError if there is no map.
