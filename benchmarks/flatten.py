@@ -35,7 +35,7 @@ import numpy as np
 from quasiharmonic import boundary_loops, certify, distortion, flatten, io, surfaces
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.geometry.mesh.fans import make_fans
+from quasiharmonic.geometry.mesh.splitting import make_fans
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from speed import machine
 

@@ -97,7 +97,7 @@ if find_spec(sys.argv[2]):
 for _ in range(4): in_threads(1)
 """,
 }
-_SERVE = "import sys; from quasiharmonic.ui.studio.server.page_worker import serve; serve(sys.argv[1])"
+_SERVE = "import sys; from quasiharmonic.ui.studio.page_worker import serve; serve(sys.argv[1])"
 _BLENDER = """
 import os, sys
 os.environ["BLENDER_USER_RESOURCES"] = sys.argv[2]

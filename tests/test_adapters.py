@@ -39,7 +39,7 @@ from quasiharmonic.apps.flattening.patterns import pattern
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.distances import surface_distances
 from quasiharmonic.io import MeshData, MeshFileError
-from quasiharmonic.io.adapters.objects import mesh_arrays
+from quasiharmonic.io.objects import mesh_arrays
 from quasiharmonic.surfaces import annulus, disk, grid
 
 Pair = namedtuple("Pair", ["V", "F"])

@@ -17,9 +17,8 @@ import pytest
 
 from quasiharmonic import batch, io
 from quasiharmonic.ui.batch import places, records
-from quasiharmonic.ui.batch.readers import find_archives
+from quasiharmonic.ui.batch.readers import find_archives, read_samples
 from quasiharmonic.ui.batch.results import Result, read_about, read_results
-from quasiharmonic.ui.batch.samples import read_samples
 from quasiharmonic.ui.batch.tar_stream import Damage, read_members
 from quasiharmonic.ui.batch.writers import Journal
 from quasiharmonic.ui.cli import main

@@ -9,7 +9,7 @@ import time
 import pytest
 
 from quasiharmonic import batch
-from quasiharmonic.ui.batch.cluster import attend
+from quasiharmonic.ui.batch.pool import attend
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.cli import main
 from shared.dask_cluster import cluster

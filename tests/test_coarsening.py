@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, Status, distortion, inverted_triangles, is_injective, solve
-from quasiharmonic.geometry.coarsening.levels import (
+from quasiharmonic.geometry.coarsening import (
     allocate_round,
     coarsen,
     has_marked_corner,
     remove_vertices,
     split_by_degree,
 )
-from quasiharmonic.geometry.coarsening.prolongation import prolong, reinsertion_positions, smooth
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
+from quasiharmonic.geometry.prolongation import prolong, reinsertion_positions, smooth
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain
 from quasiharmonic.solver.methods import VectorAdam

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quasiharmonic import Problem, certify
-from quasiharmonic.geometry.mesh.refinement import split_edges
+from quasiharmonic.geometry.mesh.splitting import split_edges
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.solver.construction.constructing import construct_and_thin, is_simple
 from quasiharmonic.solver.construction.cutting import Cutting, walk

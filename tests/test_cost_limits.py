@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, boundary_loops, certify, io, solve
-from quasiharmonic.geometry.coarsening.levels import coarsen
-from quasiharmonic.geometry.coarsening.prolongation import prolong
+from quasiharmonic.geometry.coarsening import coarsen
+from quasiharmonic.geometry.prolongation import prolong
 from quasiharmonic.linsolve import LinearSolver, available
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import VectorAdam

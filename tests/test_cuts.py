@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import crease_costs, find_cuts, surfaces
-from quasiharmonic.geometry.mesh.fans import open_along
+from quasiharmonic.geometry.mesh.splitting import open_along
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys, edges
 from quasiharmonic.targets.cuts.find import opening_cuts
 from quasiharmonic.targets.cuts.graph import edge_graph

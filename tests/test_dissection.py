@@ -238,7 +238,7 @@ def test_a_solver_without_an_order_option_keeps_the_mesh_s_numbering(monkeypatch
     assert not np.all(np.diff(Laplacian(F, len(V), loop, "superlu", V).free) > 0)
     # Whichever solver "auto" chooses.
     monkeypatch.setattr("quasiharmonic.linsolve.mkl.find_mkl", lambda: None)
-    monkeypatch.setattr("quasiharmonic.linsolve.cholmod.Cholmod.is_installed", classmethod(lambda cls: False))
+    monkeypatch.setattr("quasiharmonic.linsolve.packages.Cholmod.is_installed", classmethod(lambda cls: False))
     unaware = Laplacian(F, len(V), loop, "auto", V)
     assert unaware.solver.name == "qdldl"
     assert np.all(np.diff(unaware.free) > 0)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import find_cuts, surfaces
-from quasiharmonic.geometry.coarsening.levels import coarsen
-from quasiharmonic.geometry.mesh.fans import open_along
+from quasiharmonic.geometry.coarsening import coarsen
+from quasiharmonic.geometry.mesh.splitting import open_along
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.targets.cuts.graph import edge_graph
-from quasiharmonic.targets.cuts.levels import insert_vertices
-from quasiharmonic.targets.cuts.shortening import shorten_cuts
+from quasiharmonic.targets.cuts.shortening import insert_vertices, shorten_cuts
 from shared.closed_surfaces import torus
 from shared.cuts import SURFACES, length_of, parts, random_cut
 

@@ -13,12 +13,10 @@ from quasiharmonic.linsolve import (
     QDLDL_UP_TO,
     NotPositiveDefinite,
     available,
-    cholmod,
     make_solver,
     mkl,
-    qdldl,
+    packages,
     rslab,
-    superlu,
 )
 from shared.matrices import ALL, UNLIMITED, both, diagonal, solve, solver_for, stiffness, upper
 
@@ -32,8 +30,8 @@ def test_unknown_name():
     ("backend", "command"),
     [
         (mkl.MKL, "pip install mkl"),
-        (cholmod.Cholmod, "pip install scikit-sparse"),
-        (qdldl.Qdldl, "pip install qdldl"),
+        (packages.Cholmod, "pip install scikit-sparse"),
+        (packages.Qdldl, "pip install qdldl"),
         (rslab.Rslab, "pip install rslab"),
     ],
 )
@@ -61,11 +59,11 @@ def test_auto_uses_the_first_backend_that_loads(monkeypatch):
 
 
 def test_preference_depends_on_the_number_of_entries(monkeypatch):
-    for backend in (mkl.MKL, cholmod.Cholmod, rslab.Rslab, qdldl.Qdldl):
+    for backend in (mkl.MKL, packages.Cholmod, rslab.Rslab, packages.Qdldl):
         monkeypatch.setattr(backend, "is_installed", classmethod(lambda cls: True))
     assert available() == available(QDLDL_UP_TO + 1) == ALL == ("mkl", "cholmod", "rslab", "qdldl", "superlu")
     assert available(QDLDL_UP_TO) == ("mkl", "cholmod", "qdldl", "rslab", "superlu")
-    monkeypatch.setattr(qdldl.Qdldl, "is_installed", classmethod(lambda cls: False))
+    monkeypatch.setattr(packages.Qdldl, "is_installed", classmethod(lambda cls: False))
     assert available(1) == ("mkl", "cholmod", "rslab", "superlu")
 
 
@@ -143,7 +141,7 @@ def raising(error):
 @pytest.mark.parametrize("error", [RuntimeError("index out of bounds"), Panic("called `unwrap`")])
 def test_another_backend_replaces_rslab_on_failure(damaged, monkeypatch, step, error, qdldl_present):
     if not qdldl_present:
-        monkeypatch.setattr(qdldl.Qdldl, "is_installed", classmethod(lambda cls: False))
+        monkeypatch.setattr(packages.Qdldl, "is_installed", classmethod(lambda cls: False))
     damaged(**{step: raising(error)})
     A = stiffness(12)
     rng = np.random.default_rng(0)
@@ -176,7 +174,7 @@ def test_each_solve_reports_that_the_replacement_failed_too(damaged, monkeypatch
     with solver_for(A, "rslab") as solver:
         solver.factor(A.data)
         with monkeypatch.context() as during:
-            for other in (qdldl.Qdldl, superlu.SuperLU):
+            for other in (packages.Qdldl, packages.SuperLU):
                 during.setattr(other, "factor", raising(NotPositiveDefinite("singular")))
             for _ in range(2):
                 with pytest.raises(NotPositiveDefinite, match="singular"):

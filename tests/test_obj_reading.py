@@ -9,7 +9,7 @@ import pytest
 from quasiharmonic import io
 from quasiharmonic.io import MeshFileError
 from quasiharmonic.io.formats.obj import read_regular
-from quasiharmonic.io.lowlevel.textual import read_text
+from quasiharmonic.io.untrusted import read_text
 from shared.obj_files import SQUARE, SQUARE_F, SQUARE_VN, SQUARE_VT, bits, same
 
 

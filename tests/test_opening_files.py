@@ -11,7 +11,7 @@ import pytest
 
 from quasiharmonic import io
 from quasiharmonic.io import MeshData, MeshFileError
-from quasiharmonic.io.lowlevel.textual import read_rows
+from quasiharmonic.io.untrusted import read_rows
 from shared.obj_files import SQUARE
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX")

@@ -8,7 +8,7 @@ import json
 
 import pytest
 
-from quasiharmonic.util.optional import explain_missing, with_extra
+from quasiharmonic.util.hints import explain_missing, with_extra
 
 
 class Installed:

@@ -29,7 +29,7 @@ from quasiharmonic.targets.boundary.correspondence import viewer_axes
 from quasiharmonic.ui.cli import main
 from quasiharmonic.ui.plot import interactive
 from quasiharmonic.ui.plot.canvas import RED, new_figure, view
-from quasiharmonic.ui.plot.distortion import LABELS
+from quasiharmonic.ui.plot.measures import LABELS
 
 
 def pixels(figure):

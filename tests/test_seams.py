@@ -7,7 +7,7 @@ import pytest
 
 from quasiharmonic import certify
 from quasiharmonic.atlas import SeamedMesh
-from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.surfaces import annulus, disk, grid, random_delaunay
 from shared.meshes import lift
 from shared.seam_meshes import islands, strips

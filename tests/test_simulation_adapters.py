@@ -15,7 +15,7 @@ import pytest
 from quasiharmonic import distortion, morph, surfaces
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.io import MeshFileError
-from quasiharmonic.io.adapters.accepts_mesh import simulation_cells
+from quasiharmonic.io.accepts_mesh import simulation_cells
 from quasiharmonic.io.fem.files import read_fem
 from quasiharmonic.ui.cli import main
 from shared.simulation import quadrilaterals, second_order

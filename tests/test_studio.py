@@ -12,11 +12,11 @@ import pytest
 
 from quasiharmonic import Problem, certify, io, is_injective, quasi_harmonic_map
 from quasiharmonic.surfaces import cat, grid
+from quasiharmonic.ui.studio.drag import Follower, drag_weights
+from quasiharmonic.ui.studio.history import Storage
 from quasiharmonic.ui.studio.protocol import ProtocolError, decode, encode
-from quasiharmonic.ui.studio.session.drag import Follower, drag_weights
-from quasiharmonic.ui.studio.session.history import Storage
-from quasiharmonic.ui.studio.session.outlines import make_outline, make_polygon, read_drawing
-from quasiharmonic.ui.studio.session.session import Session
+from quasiharmonic.ui.studio.session import Session
+from quasiharmonic.ui.studio.validation import make_outline, make_polygon, read_drawing
 from shared.pages import Visitor, boundary
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'
@@ -68,7 +68,7 @@ def test_an_updated_map_is_the_harmonic_map_of_the_last_tensors():
 
 @pytest.mark.parametrize("across", [(-0.6, 0.5), (-1.5, -1.5)], ids=["crossing", "turned over"])
 def test_an_unreachable_position_shows_a_certified_map_and_the_obstruction(across, monkeypatch):
-    monkeypatch.setattr("quasiharmonic.ui.studio.session.drag.PATIENCE", 0.05)
+    monkeypatch.setattr("quasiharmonic.ui.studio.drag.PATIENCE", 0.05)
     one = Visitor()
     corner = one.session.state.corners[2]
     # The corner is moved across the opposite side, so the outline crosses itself.
@@ -328,7 +328,7 @@ def test_an_exception_of_any_type_is_reported_and_the_state_stays(monkeypatch, e
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr("quasiharmonic.ui.studio.session.session.turn_over", fail)
+    monkeypatch.setattr("quasiharmonic.ui.studio.session.turn_over", fail)
     one.does("turn")
     note = one.last("note").header
     assert note["level"] == "error"

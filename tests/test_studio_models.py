@@ -9,9 +9,9 @@ import pytest
 
 from quasiharmonic import io
 from quasiharmonic.surfaces import annulus, cat, grid, starfish
-from quasiharmonic.ui.studio.session import setup
-from quasiharmonic.ui.studio.session.setup import make_first_state
-from quasiharmonic.ui.studio.session.surface import MAX_TRIANGLES, make_sheet
+from quasiharmonic.ui.studio import setup
+from quasiharmonic.ui.studio.setup import make_first_state
+from quasiharmonic.ui.studio.surface import MAX_TRIANGLES, make_sheet
 from shared.pages import Visitor
 
 
@@ -172,7 +172,7 @@ def test_the_surface_is_shown_before_its_map_and_every_step_reports_progress():
 
 @pytest.mark.slow
 def test_a_large_model_that_must_be_cut_opens_without_a_map(monkeypatch):
-    monkeypatch.setattr("quasiharmonic.ui.studio.session.setup.MAX_AUTOMATIC", 100)
+    monkeypatch.setattr("quasiharmonic.ui.studio.setup.MAX_AUTOMATIC", 100)
     one = Visitor(*starfish(3, 8))
     shown = one.last("map")
     assert not shown.header["mapped"]

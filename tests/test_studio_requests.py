@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("websockets", reason="the extra studio is not installed")
 
-from quasiharmonic.ui.studio.server import server as served
+from quasiharmonic.ui.studio import server as served
 
 UPGRADE = (
     b"Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"

@@ -20,10 +20,10 @@ pytest.importorskip("websockets", reason="the extra studio is not installed")
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from quasiharmonic.ui.cli import main
-from quasiharmonic.ui.studio.assets import assets, bundle
+from quasiharmonic.ui.studio import page_worker
+from quasiharmonic.ui.studio import server as served
+from quasiharmonic.ui.studio.page import assets, bundle
 from quasiharmonic.ui.studio.protocol import decode, encode
-from quasiharmonic.ui.studio.server import page_worker
-from quasiharmonic.ui.studio.server import server as served
 from quasiharmonic.util.options import ENERGIES, UnwrapOptions
 from shared.studio_server import Running, children, hear, nobody_is_left
 
@@ -161,7 +161,7 @@ def test_the_view_is_available_as_one_module():
 
 def test_without_websockets_the_command_names_the_extra(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
-    monkeypatch.delitem(sys.modules, "quasiharmonic.ui.studio.server.server")
+    monkeypatch.delitem(sys.modules, "quasiharmonic.ui.studio.server")
     assert main(["studio", "--no-browser"]) == 2
     assert "[studio]'" in capsys.readouterr().err
 

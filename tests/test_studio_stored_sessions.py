@@ -9,8 +9,8 @@ pytest.importorskip("websockets", reason="the extra studio is not installed")
 
 from websockets.exceptions import ConnectionClosed
 
+from quasiharmonic.ui.studio import server as served
 from quasiharmonic.ui.studio.protocol import encode
-from quasiharmonic.ui.studio.server import server as served
 from shared.studio_server import children, hear, nobody_is_left, session_page
 
 

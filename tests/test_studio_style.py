@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from quasiharmonic.ui.studio.assets import assets
+from quasiharmonic.ui.studio.page import assets
 
 TEXT, SHAPE = 4.5, 3.0
 

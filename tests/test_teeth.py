@@ -10,7 +10,7 @@ import pytest
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.teeth import move_teeth
-from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.surfaces import grid
 
 V, F = grid(8, 8)

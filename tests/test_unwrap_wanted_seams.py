@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic import unwrap
-from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.surfaces import starfish
 from shared.closed_surfaces import torus
 from shared.examples import examples

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quasiharmonic import atlas, certify, clean, flatten, inspect_mesh, io, unwrap
-from quasiharmonic.geometry.mesh.fans import find_representatives
+from quasiharmonic.geometry.mesh.splitting import find_representatives
 from quasiharmonic.io import MeshData
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.cli import main
@@ -381,5 +381,5 @@ def test_check_of_a_planar_mesh_welds_equal_positions(tmp_path, capsys):
 
 
 def test_the_import_stays_light():
-    code = "import sys, quasiharmonic.geometry.mesh.fans; print('scipy.spatial' in sys.modules)"
+    code = "import sys, quasiharmonic.geometry.mesh.splitting; print('scipy.spatial' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

@@ -9,7 +9,7 @@ from quasiharmonic import Problem, boundary_loops, certify, injective_map, solve
 from quasiharmonic.io import MeshData, checkerboard, own_texture, read_mesh, write_map
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui import notebook
-from quasiharmonic.ui.studio.assets import bundle
+from quasiharmonic.ui.studio.page import bundle
 from quasiharmonic.ui.studio.protocol import decode, encode
 
 V, F = disk(5)

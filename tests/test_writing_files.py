@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import io
-from quasiharmonic.io import MeshData, OutputError
+from quasiharmonic.io import MeshData, OutputError, atomic
 from quasiharmonic.io.errors import FileInUseError
-from quasiharmonic.io.lowlevel import atomic
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs POSIX")
 

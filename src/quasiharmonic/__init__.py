@@ -8,7 +8,7 @@ from importlib import import_module
 
 import lazy_loader
 
-from quasiharmonic.util.display import register_renderer
+from quasiharmonic.util.outcome import register_renderer
 
 __version__ = "0.2.0"
 

@@ -4,7 +4,7 @@ from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict, IslandVerdict, 
 from quasiharmonic.apps.atlas.island_functions import flatten, harmonise, injective_map, pack, polish
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, MappedIsland
 from quasiharmonic.apps.atlas.packing.pack import Packing, Placement, pack_charts
-from quasiharmonic.io.adapters.objects import as_seamed_mesh
+from quasiharmonic.io.objects import as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 
 __all__ = [

@@ -29,7 +29,7 @@ from quasiharmonic.apps.uv_repair import RepairedIsland, RepairResult
 from quasiharmonic.energies.distances import DistanceError
 from quasiharmonic.energies.measures import Distortion, Statistics
 from quasiharmonic.geometry.exact.certificate import Certificate
-from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction
 from quasiharmonic.problem.inspection import MeshReport
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Snapshot, Stage, Status, Step

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic import flatten, surfaces
-from quasiharmonic.geometry.mesh.fans import open_along
+from quasiharmonic.geometry.mesh.splitting import open_along
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.targets.cuts.find import without_loose_ends
 from shared.closed_surfaces import TETRAHEDRON, blocks, double_torus, torus

@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from quasiharmonic.io.lowlevel import atomic
+from quasiharmonic.io import atomic
 from quasiharmonic.ui.batch import groups, metadata, worker
 
 replace = os.replace

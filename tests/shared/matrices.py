@@ -11,9 +11,9 @@ import scipy.sparse as sp
 from quasiharmonic.linsolve import (
     BACKENDS,
     available,
-    cholmod,
     make_solver,
     mkl,
+    packages,
     rslab,
 )
 
@@ -22,7 +22,7 @@ ALL = tuple(BACKENDS)
 OTHER_SIZES = {
     "mkl for large": (mkl, "SEQUENTIAL_BELOW"),
     "mkl padded": (mkl, "PAD_FROM"),
-    "cholmod for large": (cholmod, "SIMPLICIAL_BELOW"),
+    "cholmod for large": (packages, "SIMPLICIAL_BELOW"),
     "rslab for large": (rslab, "SEQUENTIAL_BELOW"),
 }
 

@@ -9,7 +9,7 @@ import numpy as np
 from quasiharmonic.io import MeshData
 from quasiharmonic.io.formats.obj import read_regular
 from quasiharmonic.io.formats.objlines import read_obj_lines
-from quasiharmonic.io.lowlevel.textual import read_text
+from quasiharmonic.io.untrusted import read_text
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 SQUARE_VT = "vt 0 0\nvt 2 0\nvt 2 2\nvt 0 2\n"

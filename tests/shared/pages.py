@@ -11,8 +11,8 @@ import numpy as np
 from quasiharmonic import boundary_loops, io
 from quasiharmonic.surfaces import cat
 from quasiharmonic.ui.studio.protocol import MessageFrame, decode, encode
-from quasiharmonic.ui.studio.session.session import Session
-from quasiharmonic.ui.studio.session.surface import make_sheet, read_sheet
+from quasiharmonic.ui.studio.session import Session
+from quasiharmonic.ui.studio.surface import make_sheet, read_sheet
 
 
 class Visitor:

@@ -10,7 +10,7 @@ from multiprocessing.context import BaseContext
 IMPORTS = [
     "distributed.cli.dask_scheduler",
     "distributed.cli.dask_worker",
-    "quasiharmonic.ui.batch.cluster",
+    "quasiharmonic.ui.batch.pool",
     "quasiharmonic.ui.batch.supervisor",
     "quasiharmonic.ui.batch.worker",
 ]

@@ -16,8 +16,8 @@ pytest.importorskip("websockets", reason="the extra studio is not installed")
 from websockets.sync.client import connect
 
 from quasiharmonic.surfaces import cat
+from quasiharmonic.ui.studio import server as served
 from quasiharmonic.ui.studio.protocol import decode
-from quasiharmonic.ui.studio.server import server as served
 
 
 class Running:
@@ -98,7 +98,7 @@ def children():
     found = []
     for process in psutil.Process().children():
         with contextlib.suppress(psutil.Error):
-            if "quasiharmonic.ui.studio.server.page_worker" in " ".join(process.cmdline()):
+            if "quasiharmonic.ui.studio.page_worker" in " ".join(process.cmdline()):
                 found.append(process)
     return found
 

@@ -37,7 +37,7 @@ from quasiharmonic.util.arrays import (
     reject,
     triangle_array,
 )
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 #: ARAP, and a barrier that keeps triangles from collapsing.
 _ELASTIC = Combination((1.0, ARAP()), (0.1, AreaBarrier()))

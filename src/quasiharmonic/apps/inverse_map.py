@@ -22,8 +22,8 @@ from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.accepts_mesh import init_accepts_mesh
-from quasiharmonic.io.adapters.objects import MeshLike
+from quasiharmonic.io.accepts_mesh import init_accepts_mesh
+from quasiharmonic.io.objects import MeshLike
 from quasiharmonic.problem.certification import certify
 from quasiharmonic.util.arrays import (
     FloatArray,

@@ -20,8 +20,8 @@ import numpy as np
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.reference import rest_shapes
+from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.geometry.mesh.topology import boundary_edges, components
 from quasiharmonic.io.seamed_mesh import Island
 from quasiharmonic.problem import Problem

@@ -19,7 +19,7 @@ from functools import partial
 from threading import Lock
 from typing import Any
 
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 with explain_missing("quasiharmonic.jax needs JAX", extra="jax"):
     import jax

@@ -17,7 +17,7 @@ from quasiharmonic.io.models.appearance import Appearance, ImageUse, NamedImage,
 from quasiharmonic.io.models.meshdata import MeshData, normals_of
 from quasiharmonic.io.models.textures import Texture, texture_of
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 Bytes = NDArray[np.uint8]
 #: Longest side of an image that is read, in pixels.

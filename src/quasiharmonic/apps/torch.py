@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 with explain_missing("quasiharmonic.torch needs PyTorch", extra="torch"):
     import torch

@@ -18,7 +18,7 @@ from quasiharmonic.apps.atlas import atlas_verdict
 from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict, IslandReport, mirrored_islands
 from quasiharmonic.apps.island_repair import IslandRepair
 from quasiharmonic.geometry.exact.certificate import certify
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import Status, Step

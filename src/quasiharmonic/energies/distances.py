@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.geodesics import chain_lengths, edge_graph, neighbours_within, straight_segments
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

@@ -12,7 +12,7 @@ from quasiharmonic.energies.distances import DistanceError, surface_distances
 from quasiharmonic.energies.energies import ARAP, MIPS, Deformation, SymmetricDirichlet
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.reference import rest_shapes
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import (
     ComplexArray,
     FloatArray,
@@ -27,8 +27,8 @@ from quasiharmonic.util.arrays import (
     triangle_rows,
     vertex_array,
 )
-from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.optional import make_dataframe
+from quasiharmonic.util.hints import make_dataframe
+from quasiharmonic.util.outcome import Displayable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -27,14 +27,14 @@ from quasiharmonic.energies.newton.sliding_boundary import SlidingModel, move_bo
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.reference import rest_shapes
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run, run_within
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe, find_exponent, map_array, names_of
+from quasiharmonic.util.hints import suggest
 from quasiharmonic.util.options import MapOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
-from quasiharmonic.util.spelling import suggest
 
 #: Polishing steps of `smooth`. On about 10,000 triangles they take a few times as long as the first map and go nearly
 #: as far as convergence: they lower the MIPS energy to a fifth and the worst stretch to a hundredth.

@@ -1,6 +1,9 @@
 # The public names. `__init__.py` imports each when it is first used.
 
-from .adapters.objects import write_map as write_map
+from .atomic import check_writable as check_writable
+from .atomic import new_folder as new_folder
+from .atomic import no_remains as no_remains
+from .atomic import write_whole as write_whole
 from .errors import MeshFileError as MeshFileError
 from .errors import OutputError as OutputError
 from .fields import DisplacementField as DisplacementField
@@ -24,10 +27,6 @@ from .formats.ply import write_ply as write_ply
 from .formats.stl import read_stl as read_stl
 from .looks import own_texture as own_texture
 from .looks import texture_names as texture_names
-from .lowlevel.atomic import check_writable as check_writable
-from .lowlevel.atomic import new_folder as new_folder
-from .lowlevel.atomic import no_remains as no_remains
-from .lowlevel.atomic import write_whole as write_whole
 from .mesh_files import ProblemArrays as ProblemArrays
 from .mesh_files import check_output as check_output
 from .mesh_files import not_held as not_held
@@ -54,6 +53,7 @@ from .models.meshdata import refined_mesh as refined_mesh
 from .models.textures import Texture as Texture
 from .models.textures import checkerboard as checkerboard
 from .models.textures import read_texture as read_texture
+from .objects import write_map as write_map
 from .registry import FORMATS as FORMATS
 from .registry import Format as Format
 from .registry import find_format as find_format

@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.io.atomic import encode_by, write_whole
 from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
-from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
-from quasiharmonic.io.lowlevel.textual import read_bytes
+from quasiharmonic.io.untrusted import check_size, read_bytes, read_npy
 from quasiharmonic.util.arrays import FloatArray
-from quasiharmonic.util.optional import explain_missing
-from quasiharmonic.util.untrusted import check_size, read_npy
+from quasiharmonic.util.hints import explain_missing
 
 # Bytes in which a header must end.
 _LONGEST = 1 << 20

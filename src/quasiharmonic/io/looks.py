@@ -18,7 +18,6 @@ from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.formats.gltf import document as gltf
 from quasiharmonic.io.formats.gltf.looks import find_objects, gltf_appearance
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf
-from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.appearance import (
     Appearance,
     ImageUse,
@@ -31,7 +30,7 @@ from quasiharmonic.io.models.appearance import (
 )
 from quasiharmonic.io.models.meshdata import MeshData, colours_of
 from quasiharmonic.io.models.textures import Texture, texture_of
-from quasiharmonic.util.untrusted import resolve_beside
+from quasiharmonic.io.untrusted import read_bytes, resolve_beside
 
 # Entries of material libraries about images that `read_appearance` reads.
 _IMAGES: dict[bytes, Role] = {b"map_Kd": "colour", b"map_Ke": "emission"}

@@ -18,14 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
+from quasiharmonic.io.atomic import check_writable
 from quasiharmonic.io.errors import MeshFileError, check_path
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf, read_channel
 from quasiharmonic.io.formats.ply import CarriedPly, read_second_places
-from quasiharmonic.io.lowlevel.atomic import check_writable
-from quasiharmonic.io.lowlevel.textual import content_lines, integer, read_text
 from quasiharmonic.io.models.mesh_maps import vertex_places, with_corner_map
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.registry import find_format, find_function
+from quasiharmonic.io.untrusted import content_lines, integer, read_text
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -35,7 +35,7 @@ from quasiharmonic.util.arrays import (
     triangle_names,
     vertex_names,
 )
-from quasiharmonic.util.optional import with_extra
+from quasiharmonic.util.hints import with_extra
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshData:

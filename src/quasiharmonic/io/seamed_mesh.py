@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.fans import fans, find_representatives, number_fans, renumber
+from quasiharmonic.geometry.mesh.splitting import fans, find_representatives, number_fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
 from quasiharmonic.util.arrays import (
     BoolArray,

@@ -27,10 +27,10 @@ __all__ = ["LinearSolver", "NotPositiveDefinite", "available", "make_solver", "t
 # Fastest first: the order in which "auto" tries the backends. Each entry is the module and the class in it.
 BACKENDS = {
     "mkl": ("mkl", "MKL"),
-    "cholmod": ("cholmod", "Cholmod"),
+    "cholmod": ("packages", "Cholmod"),
     "rslab": ("rslab", "Rslab"),
-    "qdldl": ("qdldl", "Qdldl"),
-    "superlu": ("superlu", "SuperLU"),
+    "qdldl": ("packages", "Qdldl"),
+    "superlu": ("packages", "SuperLU"),
 }
 # Number of entries in the upper triangle up to which QDLDL is tried before rslab, whose supernodes have an overhead.
 # Analysis and ten factorisations take the same time at 40,000 entries of a Laplacian (10,000 unknowns). For Newton

@@ -21,8 +21,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from quasiharmonic.linsolve.base import LinearSolver, NotPositiveDefinite
-from quasiharmonic.linsolve.qdldl import Qdldl
-from quasiharmonic.linsolve.superlu import SuperLU
+from quasiharmonic.linsolve.packages import Qdldl, SuperLU
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.threads import count_cores, read_limit
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import Certificate
-from quasiharmonic.io.adapters.objects import mesh_triangles
+from quasiharmonic.io.objects import mesh_triangles
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.fans import fans, find_representatives
 from quasiharmonic.geometry.mesh.reference import flat_triangles
+from quasiharmonic.geometry.mesh.splitting import fans, find_representatives
 from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, boundary_edges, edges, find_twins, trace_loops
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.io.adapters.objects import MeshLike, mesh_triangles
+from quasiharmonic.io.accepts_mesh import accepts_mesh
+from quasiharmonic.io.objects import MeshLike, mesh_triangles
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.reference import Reference, rest_frames
 from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, components, edges, trace_loops
-from quasiharmonic.io.adapters.accepts_mesh import init_accepts_mesh
-from quasiharmonic.io.adapters.objects import MeshLike
+from quasiharmonic.io.accepts_mesh import init_accepts_mesh
+from quasiharmonic.io.objects import MeshLike
 from quasiharmonic.problem.domain import Domain
 from quasiharmonic.util.arrays import (
     ComplexArray,
@@ -34,7 +34,7 @@ from quasiharmonic.util.arrays import (
     to_points,
     triangle_rows,
 )
-from quasiharmonic.util.display import Displayable
+from quasiharmonic.util.outcome import Displayable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

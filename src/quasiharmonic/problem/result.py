@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.certificate import Certificate
-from quasiharmonic.geometry.mesh.refinement import Refined
-from quasiharmonic.io.adapters.objects import make_trimesh
+from quasiharmonic.geometry.mesh.splitting import Refined
+from quasiharmonic.io.objects import make_trimesh
 from quasiharmonic.util.arrays import ReadOnly, count_of
-from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import Displayable, Outcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

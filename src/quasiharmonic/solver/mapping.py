@@ -17,7 +17,7 @@ from quasiharmonic.energies.newton.sliding_boundary import move_onto
 from quasiharmonic.energies.polishing import polish_options, polish_result
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.io.mesh_files import ProblemArrays
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.result import MapResult, Status, Step

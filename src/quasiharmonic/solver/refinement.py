@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
-from quasiharmonic.geometry.mesh.refinement import Refined, compose, split_edges
+from quasiharmonic.geometry.mesh.splitting import Refined, compose, split_edges
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Stage, Status

@@ -17,14 +17,14 @@ from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.curves.arcs import Arc
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
-from quasiharmonic.io.lowlevel.textual import read_pairs
+from quasiharmonic.io.untrusted import read_pairs
 from quasiharmonic.targets.outlines import shapes as outlines
 from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces
 from quasiharmonic.targets.outlines.letters import Font, glyph_paths, letter, word, word_curves
 from quasiharmonic.targets.outlines.shapes import read_polylines
 from quasiharmonic.targets.outlines.svg import read_svg, svg_paths
 from quasiharmonic.util.arrays import FloatArray, check_numbers
-from quasiharmonic.util.spelling import suggest
+from quasiharmonic.util.hints import suggest
 
 _SHAPES = "disk", "ellipse:2x1", "rect:2x1", "polygon:6", "star:5", "ring:0.5", "letter:G", "word:QH"
 FORMS = f"{', '.join(_SHAPES)}, or a file .svg, .txt or .csv"

@@ -1,7 +1,7 @@
 """HTML and figures of results, as notebooks display them.
 
 The HTML is an escaped summary and the figure, which depends on the result's type. `quasiharmonic/__init__.py` registers
-this module with `util.display`, which imports it when a result is displayed.
+this module with `util.outcome`, which imports it when a result is displayed.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.ui import plot
 from quasiharmonic.ui.plot.canvas import RED, caption, new_figure, png_bytes, verdict
-from quasiharmonic.ui.plot.elements import cut_tetrahedra, elements_figure, outline_elements
 from quasiharmonic.ui.plot.maps import map_figure
-from quasiharmonic.util.display import Displayable
+from quasiharmonic.ui.plot.measures import cut_tetrahedra, elements_figure, outline_elements
+from quasiharmonic.util.outcome import Displayable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.util.spelling import suggest
+from quasiharmonic.util.hints import suggest
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

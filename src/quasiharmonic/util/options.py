@@ -15,7 +15,7 @@ from importlib import import_module
 from numbers import Real
 from typing import Any, TypeVar
 
-from quasiharmonic.util.spelling import suggest
+from quasiharmonic.util.hints import suggest
 
 F = TypeVar("F", bound=Callable[..., Any])
 #: A function that raises an error for the name of an option and a wrong value.

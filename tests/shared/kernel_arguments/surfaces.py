@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic import boundary_loops
 from quasiharmonic.apps.atlas.packing.board import list_runs
-from quasiharmonic.geometry.coarsening.levels import allocate_round, remove_vertices
+from quasiharmonic.geometry.coarsening import allocate_round, remove_vertices
 from quasiharmonic.surfaces import annulus, disk
 from quasiharmonic.targets.cuts.graph import edge_graph
 from shared.kernel_arguments.registry import ARGUMENTS, Arguments, arguments_of, numbers, soup

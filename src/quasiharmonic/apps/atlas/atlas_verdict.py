@@ -11,10 +11,10 @@ import numpy as np
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
-from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
+from quasiharmonic.io.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, names_of
-from quasiharmonic.util.optional import make_dataframe
+from quasiharmonic.util.hints import make_dataframe
 from quasiharmonic.util.outcome import Verdict
 
 if TYPE_CHECKING:

@@ -29,15 +29,15 @@ from quasiharmonic.geometry.curves.boundary_curves import sliding_curves
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.objects import MeshLike, as_seamed_mesh
+from quasiharmonic.io.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.search.harmonising import harmonise_map
 from quasiharmonic.targets import outline
+from quasiharmonic.targets.boundary.boundary_to import fit_boundary
 from quasiharmonic.targets.boundary.corner_pins import CornerSpec
-from quasiharmonic.targets.boundary.fitting import fit_boundary
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

@@ -14,7 +14,7 @@ from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, AtlasVerdict, IslandR
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.geometry.mesh.topology import manifold_edges
 from quasiharmonic.io import MeshData, refined_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island

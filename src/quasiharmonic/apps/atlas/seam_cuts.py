@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.fans import open_along
 from quasiharmonic.geometry.mesh.polygons import Polygons
+from quasiharmonic.geometry.mesh.splitting import open_along
 from quasiharmonic.geometry.mesh.topology import edges, pair_keys, trace_loops
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.util.arrays import FloatArray, IntArray, edge_names, triangle_array, vertex_array

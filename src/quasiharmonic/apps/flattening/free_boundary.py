@@ -32,8 +32,8 @@ from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
-from quasiharmonic.geometry.mesh.fans import weld_triangles
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.geometry.mesh.splitting import weld_triangles
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run, run_within

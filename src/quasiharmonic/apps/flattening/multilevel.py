@@ -4,12 +4,12 @@ A limb of a thousand triangles, which a map into a disk shrinks to a millionth, 
 mesh. So steps on the coarse mesh replace steps on the whole mesh, also to resolve overlaps.
 
 Each boundary loop is filled by a fan around a new vertex, its *hub*. Boundary vertices then become interior vertices,
-and `quasiharmonic.geometry.coarsening.levels` can remove them like others. Hubs are kept, and get no new edges. Without
+and `quasiharmonic.geometry.coarsening` can remove them like others. Hubs are kept, and get no new edges. Without
 the hubs, a coarse mesh with coarse loops remains.
 
 Prolongation lays the ring of each removed vertex out flat around it by its rest angles and lengths. The affine map that
 fits the flat ring best to the ring's current positions also maps the vertex. If this inverts a triangle, the vertex
-gets the position that gives its triangles the best shape, as in `quasiharmonic.geometry.coarsening.prolongation`. This
+gets the position that gives its triangles the best shape, as in `quasiharmonic.geometry.prolongation`. This
 position is inside its ring and the coarse image. A prolonged map is improved locally before Newton steps.
 """
 
@@ -26,12 +26,12 @@ from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descen
 from quasiharmonic.apps.flattening.worst_triangles import LOWEST, smooth_map, thick_energy
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.geometry.coarsening.levels import coarsen
-from quasiharmonic.geometry.coarsening.prolongation import reinsertion_positions
+from quasiharmonic.geometry.coarsening import coarsen
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.geometry.mesh.fans import make_fans
 from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.splitting import make_fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.geometry.prolongation import reinsertion_positions
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, invert_indices, mark, to_points

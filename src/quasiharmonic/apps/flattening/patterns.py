@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import components
+from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.io.errors import check_path
-from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
 from quasiharmonic.problem.certification import certify
 from quasiharmonic.util.arrays import FloatArray, check_choice, check_non_negative, map_array
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 #: Millimetres per unit of the map.
 UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}

@@ -29,9 +29,9 @@ from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.geometry.coarsening.levels import has_marked_corner
-from quasiharmonic.geometry.coarsening.prolongation import are_positive
+from quasiharmonic.geometry.coarsening import has_marked_corner
 from quasiharmonic.geometry.mesh.reference import rest_frames, rest_shapes
+from quasiharmonic.geometry.prolongation import are_positive
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, to_points
 
 #: Minimum height of a coarse mesh's triangles, relative to their longest side.

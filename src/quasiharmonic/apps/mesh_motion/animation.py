@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import BoolArray, FloatArray, check_finite, count_of, describe, names_of, real_array
-from quasiharmonic.util.optional import make_dataframe
+from quasiharmonic.util.hints import make_dataframe
 from quasiharmonic.util.outcome import SummarisedOutcome, Verdict, as_plain
 
 if TYPE_CHECKING:

@@ -13,8 +13,7 @@ from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.elements import corner_triangles, jacobian_coefficients, name_elements
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
-from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.outcome import OutcomeOf, SummarisedOutcome, as_plain
+from quasiharmonic.util.outcome import Displayable, OutcomeOf, SummarisedOutcome, as_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

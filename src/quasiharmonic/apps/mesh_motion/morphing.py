@@ -41,7 +41,7 @@ from quasiharmonic.geometry.mesh.elements import (
     reverse_elements,
 )
 from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
-from quasiharmonic.io.adapters.accepts_mesh import accepts_planar_mesh
+from quasiharmonic.io.accepts_mesh import accepts_planar_mesh
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step

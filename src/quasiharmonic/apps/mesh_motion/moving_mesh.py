@@ -34,8 +34,8 @@ from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.elements import check_spread
 from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.accepts_mesh import init_accepts_planar_mesh
-from quasiharmonic.io.adapters.objects import MeshLike
+from quasiharmonic.io.accepts_mesh import init_accepts_planar_mesh
+from quasiharmonic.io.objects import MeshLike
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import (

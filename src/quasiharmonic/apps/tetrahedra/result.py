@@ -17,8 +17,7 @@ from quasiharmonic.apps.tetrahedra.certificate import TetrahedraCertificate
 from quasiharmonic.apps.tetrahedra.contacts import edges_meeting_triangles
 from quasiharmonic.apps.tetrahedra.elements import EDGES, FACES, SignArray, find_mesh_edges
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, names_of
-from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.outcome import Outcome, as_plain
+from quasiharmonic.util.outcome import Displayable, Outcome, as_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

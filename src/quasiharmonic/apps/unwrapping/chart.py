@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
-from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 

@@ -36,7 +36,7 @@ from quasiharmonic.apps.unwrapping.joining import join_small_charts
 from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
 from quasiharmonic.apps.unwrapping.teeth import move_teeth
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.util.arrays import mark
 from quasiharmonic.util.progress import heartbeat, keep_time_limit

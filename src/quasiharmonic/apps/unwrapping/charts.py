@@ -24,8 +24,8 @@ from quasiharmonic.apps.unwrapping.unfolding import unfold_small_components
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.geometry.mesh.fans import fans, split_parts
 from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.splitting import fans, split_parts
 from quasiharmonic.geometry.mesh.topology import are_sides, boundary_edges
 from quasiharmonic.targets.cuts.find import find_cuts_by
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, mark, repeat_each, scale_to_unit

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from quasiharmonic.apps.unwrapping.exclusion import exclude
 from quasiharmonic.apps.unwrapping.sheets import join_sheets
 from quasiharmonic.apps.unwrapping.widening import widen
-from quasiharmonic.geometry.mesh.fans import find_representatives
+from quasiharmonic.geometry.mesh.splitting import find_representatives
 from quasiharmonic.geometry.mesh.topology import are_collapsed, boundary_edges, components, edge_keys, pair_keys
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.inspection import MeshReport, find_close_vertices, inspect_mesh, tabulate_elements
 from quasiharmonic.util.arrays import (
     BoolArray,

@@ -22,11 +22,11 @@ from quasiharmonic.apps.flattening.worst_triangles import mark_around
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.geometry.coarsening.levels import Removal, has_marked_corner
+from quasiharmonic.geometry.coarsening import Removal, has_marked_corner
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
-from quasiharmonic.geometry.mesh.fans import split_parts
 from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.splitting import split_parts
 from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian

@@ -14,8 +14,8 @@ from quasiharmonic.apps.unwrapping.layout import MAX_COMPARED, LayoutChoice
 from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
-from quasiharmonic.geometry.mesh.fans import renumber
 from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.splitting import renumber
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, to_points
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH
 from quasiharmonic.apps.unwrapping.flat_parts import covers_once
-from quasiharmonic.geometry.mesh.fans import fans, renumber
+from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_pairs, label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_exponent
 

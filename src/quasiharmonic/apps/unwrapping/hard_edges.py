@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.model_files import label_statements
-from quasiharmonic.geometry.mesh.fans import find_representatives
+from quasiharmonic.geometry.mesh.splitting import find_representatives
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.io.models.meshdata import MeshData, normals_of
 from quasiharmonic.util.arrays import BoolArray, IntArray

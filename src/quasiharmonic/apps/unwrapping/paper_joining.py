@@ -18,7 +18,7 @@ from quasiharmonic.apps.unwrapping.pieces import Pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import SAME, meet
 from quasiharmonic.geometry.exact.loops import check_loops
-from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_points
 

@@ -18,8 +18,8 @@ from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, 
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, meet, spanning_links
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.geometry.mesh.fans import fans
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes, surface_area
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
 from quasiharmonic.util.progress import heartbeat

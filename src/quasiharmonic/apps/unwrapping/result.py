@@ -13,11 +13,10 @@ from quasiharmonic.apps.inverse_map import ChartInverse
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
-from quasiharmonic.io.adapters.objects import make_trimesh
+from quasiharmonic.io.objects import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, find_exponent, names_of
-from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import Displayable, Outcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -15,10 +15,10 @@ from quasiharmonic.apps.inverse_map import ChartInverse
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.model_files import label_statements
 from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStatus
-from quasiharmonic.io.adapters.accepts_mesh import AcceptsMesh
-from quasiharmonic.io.adapters.objects import MeshLike, make_trimesh, mesh_arrays, stands_for_mesh
+from quasiharmonic.io.accepts_mesh import AcceptsMesh
 from quasiharmonic.io.mesh_files import read_mesh
 from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.objects import MeshLike, make_trimesh, mesh_arrays, stands_for_mesh
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

@@ -12,8 +12,8 @@ from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certi
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.layout import ChartLayout, find_differing_sides
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.reference import area_vectors
+from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,

@@ -16,8 +16,8 @@ from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges, find_hinges
 from quasiharmonic.apps.unwrapping.pieces import CREASE
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, spanning_links
-from quasiharmonic.geometry.mesh.fans import fans
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
 

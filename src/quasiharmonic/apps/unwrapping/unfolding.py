@@ -12,8 +12,8 @@ from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.flat_parts import covers_once
 from quasiharmonic.apps.unwrapping.hinges import find_hinges
 from quasiharmonic.apps.unwrapping.unrolling import lay_along, spanning_links
-from quasiharmonic.geometry.mesh.fans import fans, renumber
 from quasiharmonic.geometry.mesh.reference import area_vectors
+from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 

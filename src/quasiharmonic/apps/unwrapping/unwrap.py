@@ -36,7 +36,7 @@ from quasiharmonic.apps.unwrapping.selection import keep_charts, read_faces, sel
 from quasiharmonic.apps.unwrapping.straightening import Strip, straighten_strips
 from quasiharmonic.apps.unwrapping.symmetry import check_symmetry
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.run import run_until
 from quasiharmonic.targets.cuts.find import side_costs
 from quasiharmonic.util.arrays import (

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.pieces import find_pieces
-from quasiharmonic.geometry.mesh.fans import fans
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import are_sides, edge_keys, label_components, mark_sides, pair_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_range, edge_names, index_array, mark
 

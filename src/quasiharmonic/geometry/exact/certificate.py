@@ -51,8 +51,7 @@ from quasiharmonic.util.arrays import (
     make_unchangeable,
     vertex_names,
 )
-from quasiharmonic.util.display import Displayable
-from quasiharmonic.util.outcome import Verdict
+from quasiharmonic.util.outcome import Displayable, Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

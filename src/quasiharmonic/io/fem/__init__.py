@@ -1,4 +1,4 @@
 """Read and write files of finite-element meshes: Gmsh, legacy VTK, VTU.
 
-The package builds on `geometry.mesh.elements` and `io.lowlevel.atomic`. Start reading in `files`.
+The package builds on `geometry.mesh.elements` and `io.atomic`. Start reading in `files`.
 """

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.io.atomic import check_writable, write_whole
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.fem.mesh_parts import MeshParts
-from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
-from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.mesh_maps import is_planar
 from quasiharmonic.io.registry import find_function, suffixes
+from quasiharmonic.io.untrusted import read_bytes
 from quasiharmonic.util.arrays import FloatArray, IntArray, names_of, vertex_array
 
 # Errors that readers may raise on damaged files.

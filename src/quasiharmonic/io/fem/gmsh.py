@@ -11,8 +11,8 @@ import numpy as np
 
 from quasiharmonic.geometry.mesh.elements import join_elements, join_solids
 from quasiharmonic.io.fem.mesh_parts import SUPPORTED, MeshParts, Table, TableReader, replace_numbers, stack_tables
+from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
-from quasiharmonic.util.untrusted import check_end
 
 # Number of nodes of each kind of element that is read, and of the kinds that are skipped: lines and points.
 _ELEMENTS = {2: 3, 3: 4, 9: 6}

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.geometry.mesh.elements import join_elements, join_solids
+from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
-from quasiharmonic.util.untrusted import check_end
 
 #: Arrays of points or cells by name; each callable returns (n, k) values.
 Fields = Mapping[str, Callable[[], FloatArray]]

@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 
 from quasiharmonic.io.fem.mesh_parts import MeshParts, TableReader, replace_numbers, select_elements
+from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
-from quasiharmonic.util.untrusted import check_end
 
 _SECTION = re.compile(rb"^[ \t]*([a-z_]+)[ \t\r]*$", re.MULTILINE)
 # Sections of named sets, without their ending, and those with the elements that they refer to.

@@ -26,10 +26,10 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.fem.mesh_parts import MeshParts, TableReader, find_sets, replace_numbers, select_elements
-from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
-from quasiharmonic.util.untrusted import check_end
 
 _KINDS = {
     **{f"Int{8 * size}": f"i{size}" for size in (1, 2, 4, 8)},

@@ -20,15 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.io.atomic import encode_by, write_whole
 from quasiharmonic.io.errors import MeshFileError, report_damage
-from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
-from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.mesh_maps import check_mapped, in_plane, vertex_places
 from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.untrusted import check_gifti, read_bytes, unpack_gzip
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 from quasiharmonic.util.progress import use_value
-from quasiharmonic.util.untrusted import check_gifti, unpack_gzip
 
 # The intents that the standard has for points and triangles.
 _POINTS, _TRIANGLES = 1008, 1009

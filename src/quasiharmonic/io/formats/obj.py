@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.io.atomic import no_remains, write_whole
 from quasiharmonic.io.formats.gltf.looks import gltf_appearance
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf, material_statements
 from quasiharmonic.io.formats.objlines import REFUSED, read_obj_lines
-from quasiharmonic.io.lowlevel.atomic import no_remains, write_whole
-from quasiharmonic.io.lowlevel.textual import as_text, integer_table, number_table, read_bytes
 from quasiharmonic.io.models.appearance import (
     Role,
     SurfaceMaterial,
@@ -27,6 +26,7 @@ from quasiharmonic.io.models.appearance import (
 )
 from quasiharmonic.io.models.meshdata import MeshData, OriginalLines, polygon_mesh
 from quasiharmonic.io.models.textures import Texture, texture_of
+from quasiharmonic.io.untrusted import as_text, integer_table, number_table, read_bytes
 
 # Kinds of line, for the reader that parses all lines of a kind at once.
 _BLANK, _VERTEX, _TEXTURE, _NORMAL, _FACE, _STATEMENT = range(6)

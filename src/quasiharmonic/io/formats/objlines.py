@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.lowlevel.textual import integer, number, quote_token
 from quasiharmonic.io.models.meshdata import MeshData, OriginalLines, polygon_mesh
+from quasiharmonic.io.untrusted import integer, number, quote_token
 from quasiharmonic.util.arrays import count_of
 
 # Statements that are rejected: reading would lose their geometry.

@@ -9,9 +9,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import MeshFileError, report_damage
-from quasiharmonic.io.lowlevel.atomic import write_whole
-from quasiharmonic.io.lowlevel.textual import (
+from quasiharmonic.io.models.mesh_maps import in_plane
+from quasiharmonic.io.models.meshdata import MeshData, polygon_mesh
+from quasiharmonic.io.untrusted import (
     content_lines,
     integer,
     integer_table,
@@ -20,8 +22,6 @@ from quasiharmonic.io.lowlevel.textual import (
     quote_token,
     read_text,
 )
-from quasiharmonic.io.models.mesh_maps import in_plane
-from quasiharmonic.io.models.meshdata import MeshData, polygon_mesh
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Texture coordinates, colours and normals follow the coordinates, so the reader can skip them.

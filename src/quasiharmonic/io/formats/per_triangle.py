@@ -9,8 +9,8 @@ from io import BytesIO
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables
-from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.registry import find_function
 from quasiharmonic.util.arrays import (
     FloatArray,

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import report_damage
 from quasiharmonic.io.formats.plytables import Column, Element, PlyTables, encode_tables, parse_tables
-from quasiharmonic.io.lowlevel.atomic import write_whole
-from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.mesh_maps import vertex_places, with_corner_map
 from quasiharmonic.io.models.meshdata import Carried, MeshData, colours_of, normal_lines, normals_of, polygon_mesh
+from quasiharmonic.io.untrusted import read_bytes
 from quasiharmonic.util.arrays import FloatArray, IntArray, repeat_each
 
 # Property names of texture coordinates, at vertices and at the corners of faces.

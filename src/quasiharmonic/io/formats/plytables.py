@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quasiharmonic.io.lowlevel.textual import quote_token
+from quasiharmonic.io.untrusted import check_end, quote_token
 from quasiharmonic.util.arrays import IntArray, repeat_each
-from quasiharmonic.util.untrusted import check_end
 
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),

@@ -7,10 +7,10 @@ import re
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.fans import weld_points
+from quasiharmonic.geometry.mesh.splitting import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
-from quasiharmonic.io.lowlevel.textual import read_bytes
 from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.untrusted import read_bytes
 from quasiharmonic.util.arrays import FloatArray
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

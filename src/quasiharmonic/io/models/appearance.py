@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.models.textures import MaterialTextures, Texture
 from quasiharmonic.util.arrays import FloatArray, IntArray

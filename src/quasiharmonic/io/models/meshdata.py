@@ -28,7 +28,7 @@ from quasiharmonic.util.arrays import (
 )
 
 if TYPE_CHECKING:
-    from quasiharmonic.geometry.mesh.refinement import Refined
+    from quasiharmonic.geometry.mesh.splitting import Refined
 
 
 @dataclass(frozen=True, eq=False)

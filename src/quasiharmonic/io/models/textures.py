@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.lowlevel.textual import read_bytes
+from quasiharmonic.io.untrusted import read_bytes
 
 _IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
 

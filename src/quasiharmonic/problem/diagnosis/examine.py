@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.predicates import SegmentRelation
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.io.adapters.objects import MeshLike
+from quasiharmonic.io.objects import MeshLike
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis.clipping import Effort, EffortSpentError
 from quasiharmonic.problem.diagnosis.conditions import (

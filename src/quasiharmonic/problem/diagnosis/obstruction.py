@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quasiharmonic.util.arrays import IntArray, ReadOnly, count_of
-from quasiharmonic.util.display import Displayable
+from quasiharmonic.util.outcome import Displayable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

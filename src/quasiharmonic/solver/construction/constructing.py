@@ -14,7 +14,7 @@ import numpy as np
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.exact.certificate import Certificate, certify, inverted_triangles
 from quasiharmonic.geometry.exact.loops import check_loops, winding
-from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import embed_tutte
 from quasiharmonic.problem import Domain, Problem

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.geometry.mesh.refinement import Refined, Shares, combine_shares, parents_and_weights
+from quasiharmonic.geometry.mesh.splitting import Refined, Shares, combine_shares, parents_and_weights
 from quasiharmonic.problem import Frame, Problem
 from quasiharmonic.solver.construction.half_edges import HalfEdges, Triangle
 from quasiharmonic.solver.methods.local_repair import Patch

@@ -19,7 +19,7 @@ from quasiharmonic.energies.energies import ARAP, AreaPreserving, Energy, Unsign
 from quasiharmonic.energies.springs import MassSpring
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
@@ -34,9 +34,9 @@ from quasiharmonic.util.arrays import (
     names_of,
     real_array,
 )
+from quasiharmonic.util.hints import suggest
 from quasiharmonic.util.options import HarmoniseOptions, takes
 from quasiharmonic.util.progress import reports_progress
-from quasiharmonic.util.spelling import suggest
 
 
 def _without_mesh(energy: Energy) -> Callable[[FloatArray, IntArray], Energy]:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.polishing import find_energy, polish_options, polish_result
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.io.adapters.objects import mesh_arrays, stands_for_mesh
+from quasiharmonic.io.objects import mesh_arrays, stands_for_mesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.problem import set_up_batch
 from quasiharmonic.problem.result import MapResult, Status, Step

@@ -17,10 +17,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from quasiharmonic.energies.polishing import polish_map
-from quasiharmonic.geometry.coarsening.levels import coarsen
-from quasiharmonic.geometry.coarsening.prolongation import prolong
+from quasiharmonic.geometry.coarsening import coarsen
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.mesh.reference import rest_shapes
+from quasiharmonic.geometry.prolongation import prolong
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Domain, Frame, Problem
 from quasiharmonic.problem.result import MapResult, Stage, Status

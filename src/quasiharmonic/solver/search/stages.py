@@ -26,7 +26,7 @@ from quasiharmonic.solver.methods import (
 )
 from quasiharmonic.solver.methods.base import SearchStage, StageRunner
 from quasiharmonic.util.arrays import describe
-from quasiharmonic.util.spelling import suggest
+from quasiharmonic.util.hints import suggest
 
 #: Stages of a strategy.
 Stages: TypeAlias = Sequence[SearchStage]

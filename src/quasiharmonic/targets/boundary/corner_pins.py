@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
-from quasiharmonic.io.lowlevel.textual import integer
+from quasiharmonic.io.accepts_mesh import accepts_mesh
+from quasiharmonic.io.untrusted import integer
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, points_at
 from quasiharmonic.targets.boundary.turning import BoundaryLoop, mean_turns
 from quasiharmonic.targets.outlines.contours import corners as corners_of

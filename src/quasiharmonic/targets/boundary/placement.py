@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.exact.loops import contacts
 from quasiharmonic.geometry.mesh.topology import edges, trace_loops
-from quasiharmonic.io.adapters.objects import mesh_triangles
+from quasiharmonic.io.objects import mesh_triangles
 from quasiharmonic.targets.boundary.correspondence import (
     BoundaryStretch,
     LoopPins,

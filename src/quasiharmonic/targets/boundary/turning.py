@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

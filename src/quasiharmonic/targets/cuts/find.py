@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from quasiharmonic.geometry.coarsening.levels import Removal
-from quasiharmonic.geometry.mesh.fans import open_along
+from quasiharmonic.geometry.coarsening import Removal
+from quasiharmonic.geometry.mesh.splitting import open_along
 from quasiharmonic.geometry.mesh.topology import components, edge_keys, manifold_edges, mark_sides, pair_keys
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
-from quasiharmonic.targets.cuts.levels import cut_by_levels
 from quasiharmonic.targets.cuts.reaching import extend_cuts
-from quasiharmonic.targets.cuts.shortening import shorten_cuts
+from quasiharmonic.targets.cuts.shortening import cut_by_levels, shorten_cuts
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from quasiharmonic.geometry.coarsening.levels import has_marked_corner
+from quasiharmonic.geometry.coarsening import has_marked_corner
 from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, pair_keys, pair_sides
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, pad_to_space, repeat_each, scale_to_unit

@@ -18,7 +18,7 @@ from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.targets.outlines.contours import Pieces, drop_close_points, filled, flatten, nested, signed_area
 from quasiharmonic.util.arrays import FloatArray, check_instance, check_positive, count_of, describe
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 Font = str | PathLike[str]
 _FONT_FILES = ".ttf", ".otf", ".ttc"

@@ -8,7 +8,7 @@ import numpy as np
 
 from quasiharmonic.geometry.exact.loops import join_items
 from quasiharmonic.io.errors import MeshFileError, report_damage
-from quasiharmonic.io.lowlevel.textual import is_number, number, read_text
+from quasiharmonic.io.untrusted import is_number, number, read_text
 from quasiharmonic.targets.outlines.contours import MAX_POINTS, arrange, drop_close_points, is_collinear
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_numbers, check_positive
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from quasiharmonic.geometry.curves.arcs import Arc
 from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
-from quasiharmonic.io.lowlevel.textual import read_text
+from quasiharmonic.io.untrusted import read_text
 from quasiharmonic.targets.outlines.contours import MAX_POINTS, Pieces, arrange, flatten
 from quasiharmonic.targets.outlines.svgpath import commands, parse_path
 from quasiharmonic.util.arrays import FloatArray, check_numbers, to_complex

@@ -13,14 +13,13 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from quasiharmonic import __version__
+from quasiharmonic.io.atomic import new_folder, remove_file, write_whole, writing
 from quasiharmonic.io.errors import OutputError, check_path
-from quasiharmonic.io.lowlevel.atomic import new_folder, remove_file, write_whole, writing
 from quasiharmonic.ui.batch import places, records
 from quasiharmonic.ui.batch.dataset import DataSet, Stream, scratch_folder
-from quasiharmonic.ui.batch.pool import solve_in_processes
+from quasiharmonic.ui.batch.pool import solve_in_processes, solve_on_cluster
 from quasiharmonic.ui.batch.problems import MARKER, group_small
-from quasiharmonic.ui.batch.readers import FolderReader, Scratch, find_archives
-from quasiharmonic.ui.batch.samples import results_name
+from quasiharmonic.ui.batch.readers import FolderReader, Scratch, find_archives, results_name
 from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
 from quasiharmonic.ui.batch.shards import (
     WHOLE,
@@ -35,7 +34,7 @@ from quasiharmonic.ui.batch.shards import (
 from quasiharmonic.ui.batch.supervisor import Finished, resident
 from quasiharmonic.ui.batch.writers import ArchiveWriter, FolderWriter
 from quasiharmonic.util.arrays import check_callback, check_instance, check_integer
-from quasiharmonic.util.optional import with_extra
+from quasiharmonic.util.hints import with_extra
 from quasiharmonic.util.threads import count_cores
 
 
@@ -215,8 +214,6 @@ def _solve(
         # Not more workers than problems, if their number is known.
         finished = solve_in_processes(groups, data.orders, min(jobs, data.total or jobs))
     else:
-        from quasiharmonic.ui.batch.cluster import solve_on_cluster
-
         finished = solve_on_cluster(todo, data.orders, scheduler)
 
     def count(some: Iterable[Finished]) -> None:

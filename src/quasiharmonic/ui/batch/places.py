@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
-from quasiharmonic.io.lowlevel.atomic import writing
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.io.atomic import writing
+from quasiharmonic.util.hints import explain_missing
 
 T = TypeVar("T")
 # Number of attempts, and seconds before the second one; each further pause is twice as long.

@@ -15,14 +15,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from quasiharmonic.io.atomic import remove_file, write_whole, writing
 from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
 from quasiharmonic.io.formats.obj import write_obj
 from quasiharmonic.io.formats.ply import write_ply
-from quasiharmonic.io.lowlevel.atomic import remove_file, write_whole, writing
 from quasiharmonic.io.models.meshdata import MeshData
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.io.untrusted import parse_json
+from quasiharmonic.util.hints import explain_missing
 from quasiharmonic.util.options import MAP_FORMATS
-from quasiharmonic.util.untrusted import parse_json
 
 Record = dict[str, Any]
 

@@ -13,11 +13,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, NamedTuple
 
-from quasiharmonic.io.lowlevel.atomic import write_whole
+from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.untrusted import parse_json
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.places import fetch, read_start
+from quasiharmonic.ui.batch.readers import KEYS, is_archive, is_parquet, results_name
 from quasiharmonic.ui.batch.records import Record, load_pyarrow
-from quasiharmonic.ui.batch.samples import KEYS, is_archive, is_parquet, results_name
 from quasiharmonic.ui.batch.tar_stream import (
     END_MARK,
     Damage,
@@ -29,7 +30,6 @@ from quasiharmonic.ui.batch.tar_stream import (
     read_members,
 )
 from quasiharmonic.util.options import MAP_FORMATS
-from quasiharmonic.util.untrusted import parse_json
 
 #: Suffix of the name of unfinished results.
 PART = ".part"

@@ -13,12 +13,12 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from quasiharmonic.io.atomic import new_folder, write_whole, writing
 from quasiharmonic.io.errors import OutputError, check_path
-from quasiharmonic.io.lowlevel.atomic import new_folder, write_whole, writing
+from quasiharmonic.io.untrusted import parse_json
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.problems import MARKER
 from quasiharmonic.util.arrays import describe
-from quasiharmonic.util.untrusted import parse_json
 
 
 class Shard(NamedTuple):

@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from typing import BinaryIO, NamedTuple
 
-from quasiharmonic.util.untrusted import MAX_BYTES
+from quasiharmonic.io.untrusted import MAX_BYTES
 
 _BLOCK = tarfile.BLOCKSIZE
 _CHUNK = 1 << 20

@@ -30,19 +30,19 @@ from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, each_island, merg
 from quasiharmonic.apps.flattening.free_boundary import check_flattenable
 from quasiharmonic.energies.polishing import polish_result
 from quasiharmonic.geometry.curves import BoundaryCurves
-from quasiharmonic.geometry.mesh.refinement import Refined
+from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
+from quasiharmonic.io.untrusted import use_bound
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refinement import on_refinement
-from quasiharmonic.targets.boundary.fitting import FittedProblem
+from quasiharmonic.targets.boundary.boundary_to import FittedProblem
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.util.options import PolishOptions
 from quasiharmonic.util.threads import detach_input
-from quasiharmonic.util.untrusted import use_bound
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"

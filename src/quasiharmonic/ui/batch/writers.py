@@ -14,10 +14,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from quasiharmonic.io.lowlevel.atomic import writing
+from quasiharmonic.io.atomic import writing
 from quasiharmonic.ui.batch import places, records
 from quasiharmonic.ui.batch.problems import ProblemFiles
-from quasiharmonic.ui.batch.readers import ArchiveReader, FolderReader
+from quasiharmonic.ui.batch.readers import ArchiveReader, FolderReader, is_parquet, results_name
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.results import (
     PART,
@@ -28,7 +28,6 @@ from quasiharmonic.ui.batch.results import (
     read_tar_results,
     write_results,
 )
-from quasiharmonic.ui.batch.samples import is_parquet, results_name
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.supervisor import is_valid
 

@@ -27,7 +27,7 @@ from typing import Any, NoReturn
 
 from quasiharmonic.ui.cli.process import NO_READER, Interrupts, output_failed, require_output, tell
 from quasiharmonic.ui.cli.report import ReportError, describe_error, in_options, use_options
-from quasiharmonic.util.spelling import suggest
+from quasiharmonic.util.hints import suggest
 
 # The subcommands by group, in the order of the help. Each is a module of `commands`.
 GROUPS = {

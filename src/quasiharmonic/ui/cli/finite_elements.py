@@ -112,7 +112,7 @@ def plot(options: argparse.Namespace) -> int:
 
     from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
     from quasiharmonic.ui.plot.canvas import save_picture
-    from quasiharmonic.ui.plot.elements import cut_tetrahedra, elements_figure, outline_elements
+    from quasiharmonic.ui.plot.measures import cut_tetrahedra, elements_figure, outline_elements
 
     if options.kind not in (None, "map"):
         raise ValueError(f"--kind {options.kind} needs a surface with a map: omit it for {options.input.suffix} files")

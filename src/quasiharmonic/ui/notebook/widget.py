@@ -12,18 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.io import MeshData, Texture, read_texture
-from quasiharmonic.io.adapters.objects import MeshLike, mesh_arrays, stands_for_mesh
+from quasiharmonic.io.objects import MeshLike, mesh_arrays, stands_for_mesh
 from quasiharmonic.io.registry import find_format
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
-from quasiharmonic.ui.studio.assets import bundle
+from quasiharmonic.ui.studio.page import bundle
 from quasiharmonic.ui.studio.protocol import Array, MessageFrame, ProtocolError, decode, encode
-from quasiharmonic.ui.studio.session.exports import mapped_model, write_model
-from quasiharmonic.ui.studio.session.session import Session
-from quasiharmonic.ui.studio.session.surface import PageSurface, make_sheet, read_sheet
+from quasiharmonic.ui.studio.session import Session, mapped_model, write_model
+from quasiharmonic.ui.studio.surface import PageSurface, make_sheet, read_sheet
 from quasiharmonic.util.arrays import IntArray, describe
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 with explain_missing("the widget needs anywidget", extra="notebook"):
     import anywidget

@@ -4,12 +4,16 @@ The package builds on `geometry` and `problem`. Start reading in `canvas`, then 
 """
 
 from quasiharmonic.ui.plot.animation import plot_convergence, save_animation, save_figures
-from quasiharmonic.ui.plot.boundary import plot_problem, save_boundary_figure
-from quasiharmonic.ui.plot.distortion import plot_distortion, save_distortion_figure
-from quasiharmonic.ui.plot.fields import plot_field
-from quasiharmonic.ui.plot.maps import plot_before_after, plot_map, plot_surface, save_map_figure
-from quasiharmonic.ui.plot.texture import plot_texture, save_texture_figure
-from quasiharmonic.ui.plot.unwraps import plot_unwrap
+from quasiharmonic.ui.plot.maps import (
+    plot_before_after,
+    plot_map,
+    plot_problem,
+    plot_surface,
+    save_boundary_figure,
+    save_map_figure,
+)
+from quasiharmonic.ui.plot.measures import plot_distortion, plot_field, save_distortion_figure
+from quasiharmonic.ui.plot.texture import plot_texture, plot_unwrap, save_texture_figure
 
 __all__ = [
     "plot_before_after",

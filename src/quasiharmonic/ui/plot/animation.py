@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.io.adapters.accepts_mesh import writer_accepts_mesh
+from quasiharmonic.io.accepts_mesh import writer_accepts_mesh
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.problem.result import MapResult, Step
 from quasiharmonic.ui.plot.canvas import (
@@ -29,7 +29,7 @@ from quasiharmonic.ui.plot.canvas import (
     view,
 )
 from quasiharmonic.util.arrays import FloatArray, check_instance, check_integer, check_sequence, map_array
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +102,7 @@ def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames
     quasiharmonic.io.errors.OutputError
         If the file cannot be written.
     """
-    from quasiharmonic.io.lowlevel.atomic import write_whole
+    from quasiharmonic.io.atomic import write_whole
 
     suffix = check_animation(path, frames_per_second)
     encode = _gif if suffix == ".gif" else _mp4
@@ -111,7 +111,7 @@ def save_figures(path: str | PathLike[str], figures: Iterable[Figure], *, frames
 
 def check_animation(path: str | PathLike[str], frames_per_second: int) -> str:
     """Check path and frame rate before `save_figures`, with its errors; return the suffix in lower case."""
-    from quasiharmonic.io.lowlevel.atomic import check_writable
+    from quasiharmonic.io.atomic import check_writable
 
     check_path("path", path)
     suffix = Path(path).suffix.lower()
@@ -206,7 +206,7 @@ def _mp4(pictures: Iterable[NDArray[np.uint8]], rate: int) -> bytes:
     from matplotlib import rc_context
     from matplotlib.animation import FFMpegWriter
 
-    from quasiharmonic.io.lowlevel.atomic import encode_by
+    from quasiharmonic.io.atomic import encode_by
 
     pictures = iter(pictures)
     first = next(pictures, None)

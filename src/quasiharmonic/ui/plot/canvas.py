@@ -28,7 +28,7 @@ from quasiharmonic.util.arrays import (
     triangle_rows,
     vertex_array,
 )
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -172,7 +172,7 @@ def save_picture(path: str | PathLike[str], figure: Figure) -> None:
     """
     from matplotlib import rc_context
 
-    from quasiharmonic.io.lowlevel.atomic import write_whole
+    from quasiharmonic.io.atomic import write_whole
 
     suffix = check_ending(path)
     # Equal figures give equal files: no date and no random identifiers.

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.ui.plot.canvas import RED, as_mesh
 from quasiharmonic.util.arrays import FloatArray, map_array, pad_to_space
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 #: Measures of distortion that the window offers as colours.
 SHOWN = ("isometric", "conformal", "area_ratio", "mips")
@@ -28,7 +28,7 @@ def show(V: ArrayLike, F: ArrayLike, uv: ArrayLike, *, screenshot: str | PathLik
     written as a PNG, which needs no display. ImportError if polyscope is not installed, RuntimeError if no window can
     be opened, and ValueError as `quasiharmonic.distortion`.
     """
-    from quasiharmonic.io.lowlevel.atomic import encode_by, write_whole
+    from quasiharmonic.io.atomic import encode_by, write_whole
 
     polyscope = _polyscope()
     polyscope.set_verbosity(0)

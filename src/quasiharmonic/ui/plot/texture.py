@@ -1,4 +1,7 @@
-"""Render a surface textured with a checkerboard or an image through its map."""
+"""Render a surface textured with a checkerboard or an image through its map.
+
+Also the figure of texture coordinates: the charts, a checkerboard, the stretch, and the texel density.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.topology import boundary_edges
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh, writer_accepts_mesh
+from quasiharmonic.energies.measures import distortion
+from quasiharmonic.geometry.mesh.topology import boundary_edges, components
+from quasiharmonic.io.accepts_mesh import accepts_mesh, writer_accepts_mesh
 from quasiharmonic.io.errors import check_path, report_damage
 from quasiharmonic.io.models.textures import Texture, read_texture
 from quasiharmonic.ui.plot.canvas import (
@@ -21,6 +25,8 @@ from quasiharmonic.ui.plot.canvas import (
     draw_edges,
     find_not_positive,
     new_figure,
+    paint_map,
+    paint_surface,
     panels,
     save_picture,
     scale_for_drawing,
@@ -28,13 +34,13 @@ from quasiharmonic.ui.plot.canvas import (
     verdict,
     view,
 )
+from quasiharmonic.ui.plot.measures import choose_scale, draw_bar
 from quasiharmonic.util.arrays import FloatArray, IntArray, check_integer, enumerate_each, map_array
-from quasiharmonic.util.optional import explain_missing
+from quasiharmonic.util.hints import explain_missing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
 
 # Colours of the checkerboard.
 _LIGHT = np.array((0.93, 0.93, 0.90))
@@ -42,6 +48,7 @@ _DARK = np.array((0.16, 0.38, 0.75))
 _SIDE = 600  # pixels of a panel
 _SAMPLES = 2  # per pixel and direction
 _CHUNK = 1 << 16  # samples processed together, so that they fit into the cache
+_SQUARES = 32  # of the checkerboard, along the unit square
 
 
 @accepts_mesh
@@ -87,16 +94,16 @@ def plot_texture(
     color: Callable[[FloatArray], FloatArray]
     if texture is None:
         low, size = uv.min(axis=0), float(np.ptp(uv, axis=0).max()) or 1.0
-        board, color = (uv - low) / size * squares, checkerboard_color
+        board, color = (uv - low) / size * squares, _checkerboard_color
     else:
         board, color = uv, _make_image_color(texture)
     inverted = find_not_positive(F, uv)
     seen = view(rest, F)
     figure = new_figure((9.6, 4.8))
     surface, plane = panels(figure, 2)
-    show_render(surface, seen.points, render(seen.points, seen.depth, F, board, color, inverted, seen.light))
+    _show_render(surface, seen.points, render(seen.points, seen.depth, F, board, color, inverted, seen.light))
     caption(surface, f"surface: {len(F):,} triangles")
-    show_render(plane, board, render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
+    _show_render(plane, board, render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
     draw_edges(plane, board, boundary_edges(F, len(board)))
     verdict(plane, "map", len(inverted))
     return figure
@@ -131,7 +138,7 @@ def save_texture_figure(
     save_picture(path, plot_texture(V, F, uv, squares=squares, texture=texture))
 
 
-def show_render(ax: Axes, points: FloatArray, image: FloatArray) -> None:
+def _show_render(ax: Axes, points: FloatArray, image: FloatArray) -> None:
     """Show a rendered image in axes, in the coordinates of its points."""
     low, high = _window(points)
     ax.imshow(image, interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
@@ -186,7 +193,7 @@ def render(
     return np.concatenate([shown, cover[..., None] / _SAMPLES**2], axis=2)
 
 
-def checkerboard_color(coordinates: FloatArray) -> FloatArray:
+def _checkerboard_color(coordinates: FloatArray) -> FloatArray:
     """Return the colours (k, 3) of a checkerboard whose squares have side 1."""
     column, row = np.floor(coordinates).T
     half = (column + row) / 2
@@ -250,3 +257,66 @@ def _samples(corners: FloatArray, side: int) -> Iterator[tuple[IntArray, IntArra
 
 def _cross(ax: FloatArray, ay: FloatArray, bx: FloatArray, by: FloatArray) -> FloatArray:
     return np.asarray(ax * by - ay * bx)
+
+
+@accepts_mesh
+def plot_unwrap(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Figure:
+    """Draw texture coordinates: the charts, and the surface with a checkerboard, the stretch and the texel density.
+
+    Triangles whose orientation differs from that of their chart are red.
+
+    Parameters
+    ----------
+    V : (n, 2) or (n, 3) float, or a mesh in place of ``V`` and ``F``
+        Positions; vertices on seams occur once for each chart, as in ``V[result.vmapping]`` of an `UnwrapResult`.
+    F : (f, 3) int
+    uv : (n, 2) float
+        Texture coordinates. Each connected component of ``F`` is a chart, and may be mirrored.
+
+    Returns
+    -------
+    matplotlib Figure
+        Four panels. The stretch is the larger of σ₁ and 1/σ₂ after one scaling of all charts. The texel density is
+        relative to its mean.
+
+    Raises
+    ------
+    ValueError
+        If there are no triangles, or a coordinate is not finite.
+    """
+    rest, F = as_mesh(V, F)
+    uv = map_array("uv", uv, len(rest))
+    seen = view(rest, F)
+    part = components(F, len(rest))
+    first, chart = np.unique(part, return_inverse=True)
+    a, b = uv[F[:, 1]] - uv[F[:, 0]], uv[F[:, 2]] - uv[F[:, 0]]
+    area = np.bincount(chart[F[:, 0]], a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], minlength=len(first))
+    upright = uv * np.column_stack([np.where(area[chart] < 0, -1.0, 1.0), np.ones(len(uv))])
+    found = distortion(rest, F, upright)
+    bad = np.flatnonzero(found.sigma2 <= 0)
+
+    figure = new_figure((18.4, 4.8))
+    layout, board, stretched, dense = (figure.add_axes((x, 0.02, 0.225, 0.88)) for x in (0.003, 0.233, 0.463, 0.733))
+    # Neighbouring numbers have different colours, and none is red.
+    from matplotlib import colormaps
+
+    paint_map(layout, F, uv, colormaps["viridis"](chart[F[:, 0]] * 0.618 % 1)[:, :3], bad)
+    verdict(layout, f"{len(first)} charts" if len(first) > 1 else "1 chart", len(bad))
+    _show_render(
+        board,
+        seen.points,
+        render(seen.points, seen.depth, F, uv * _SQUARES, _checkerboard_color, bad, seen.light),
+    )
+    caption(board, "checkerboard")
+    density = np.sqrt(np.where(found.area_ratio > 0, found.area_ratio, np.nan))
+    for ax, name, measure, values, left in (
+        (stretched, "stretch", "isometric", found.isometric, 0.694),
+        (dense, "texel density, relative to the mean", "area_ratio", density, 0.964),
+    ):
+        scale = choose_scale(measure, values, found.share)
+        color = scale.colors(values)
+        color[bad] = RED
+        paint_surface(ax, seen, F, shade(color, seen.light))
+        caption(ax, name)
+        draw_bar(figure, scale, (left, 0.14, 0.008, 0.74))
+    return figure

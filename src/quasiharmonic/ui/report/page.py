@@ -15,13 +15,13 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from quasiharmonic.io.lowlevel.atomic import check_writable, write_whole
+from quasiharmonic.io.atomic import check_writable, write_whole
+from quasiharmonic.io.untrusted import parse_json
 from quasiharmonic.ui.batch.records import OUTCOMES, SOLVED, Record
 from quasiharmonic.ui.batch.settings import Settings
 from quasiharmonic.ui.report import charts, statistics
 from quasiharmonic.ui.report.charts import thumbnail
 from quasiharmonic.ui.report.statistics import PHASES, BatchRun, find_worst, quantile
-from quasiharmonic.util.untrusted import parse_json
 
 STYLE = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
 _PAGE = Template(files(__package__).joinpath("page.html").read_text(encoding="utf-8"))

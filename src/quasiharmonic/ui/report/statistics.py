@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.io.untrusted import parse_json
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.problems import MARKER
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.results import find_records
 from quasiharmonic.util.arrays import FloatArray
-from quasiharmonic.util.untrusted import parse_json
 
 PHASES = "read", "setup", "map", "polish", "write", "measure"
 

@@ -1,4 +1,4 @@
 """The browser application ``qhm studio``: a server, one worker process per browser tab, and the shared session logic.
 
-The package builds on `solver` and `apps`. Start reading in `session.session`, then `server.server`.
+The package builds on `solver` and `apps`. Start reading in `session`, then `server`.
 """

@@ -38,7 +38,7 @@ from quasiharmonic.energies.distances import Sampling, SurfaceDistances, sample_
 from quasiharmonic.energies.energies import Deformation, QuadraticForm, SymmetricDirichlet
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.geometry.exact.certificate import certify
-from quasiharmonic.io.adapters.accepts_mesh import accepts_mesh
+from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, map_array, to_complex, to_points

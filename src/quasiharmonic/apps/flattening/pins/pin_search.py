@@ -30,7 +30,7 @@ from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.loops import contacts
 from quasiharmonic.geometry.exact.predicates import box_pairs_between, orientation
-from quasiharmonic.geometry.mesh.refinement import split_edges
+from quasiharmonic.geometry.mesh.splitting import split_edges
 from quasiharmonic.geometry.mesh.topology import Edges, edge_keys, edges, pair_keys
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction

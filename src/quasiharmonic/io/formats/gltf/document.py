@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.errors import MeshFileError, printable_path, report_damage
-from quasiharmonic.io.lowlevel.textual import read_bytes
-from quasiharmonic.util.untrusted import check_end, resolve_beside
+from quasiharmonic.io.untrusted import check_end, read_bytes, resolve_beside
 
 _KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _CODES = {np.dtype(kind): code for code, kind in _KINDS.items()}

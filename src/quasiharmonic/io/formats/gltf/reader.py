@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.geometry.mesh.fans import weld_points
+from quasiharmonic.geometry.mesh.splitting import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
 from quasiharmonic.io.models.meshdata import Carried, MeshData, normal_lines

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.formats.gltf.document import Document, embed_pictures
 from quasiharmonic.io.formats.gltf.looks import paint
 from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, VertexPool
-from quasiharmonic.io.lowlevel.atomic import write_whole
 from quasiharmonic.io.models.appearance import label_materials, materials_lost
 from quasiharmonic.io.models.meshdata import MeshData, colours_of, normals_of
 from quasiharmonic.io.models.textures import MaterialTextures

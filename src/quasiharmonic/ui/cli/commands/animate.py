@@ -195,8 +195,8 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
 def _array(path: Path, n: int, fixed: NDArray[np.int64]) -> NDArray[np.float64]:
     from quasiharmonic import io
     from quasiharmonic.io.errors import report_damage
+    from quasiharmonic.io.untrusted import read_npy
     from quasiharmonic.util.arrays import real_array
-    from quasiharmonic.util.untrusted import read_npy
 
     if not path.is_file():
         raise io.MeshFileError(path, "there is no such file")

@@ -90,7 +90,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
     from quasiharmonic.apps.atlas import island_functions as atlas
     from quasiharmonic.apps.flattening.patterns import write_pattern
     from quasiharmonic.energies.measures import distortion
-    from quasiharmonic.geometry.mesh.fans import weld_triangles
+    from quasiharmonic.geometry.mesh.splitting import weld_triangles
     from quasiharmonic.problem.inspection import describe_soup, find_close_vertices
     from quasiharmonic.util.arrays import count_of
 
@@ -180,7 +180,7 @@ def _mean_energy(mapped: MappedAtlas) -> float | None:
 def _weights(path: Path) -> list[float]:
     """Read one positive number per line."""
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.lowlevel.textual import read_rows
+    from quasiharmonic.io.untrusted import read_rows
 
     values = []
     for line, (value,) in read_rows(path, 1):

@@ -300,7 +300,7 @@ def _positions(path: Path, n: int, axes: int) -> tuple[IntArray, FloatArray]:
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.lowlevel.textual import read_rows
+    from quasiharmonic.io.untrusted import read_rows
 
     positions: dict[int, list[float]] = {}
     for line, (vertex, *place) in read_rows(path, 1 + axes):

@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from quasiharmonic.util.optional import with_extra
+from quasiharmonic.util.hints import with_extra
 
 
 def declare_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
     from contextlib import suppress
 
     try:
-        from quasiharmonic.ui.studio.server.server import Studio
+        from quasiharmonic.ui.studio.server import Studio
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] != "websockets":
             raise
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
 
     source = ""
     if options.input is not None:
-        from quasiharmonic.ui.studio.session.surface import read_sheet
+        from quasiharmonic.ui.studio.surface import read_sheet
 
         # Errors of the input are reported here rather than on the page.
         read_sheet(options.input)

@@ -236,8 +236,8 @@ def _read_table(path: Path) -> NDArray[np.float64]:
 
     from quasiharmonic import io
     from quasiharmonic.io.errors import report_damage
+    from quasiharmonic.io.untrusted import read_npy
     from quasiharmonic.util.arrays import real_array
-    from quasiharmonic.util.untrusted import read_npy
 
     form = io.format_of(path)
     if form is not None and form.name == "GIFTI":

@@ -40,7 +40,7 @@ from quasiharmonic.ui.cli.arguments import (
     texture_size,
     weld,
 )
-from quasiharmonic.util.optional import with_extra
+from quasiharmonic.util.hints import with_extra
 from quasiharmonic.util.options import INSTANCES, BakeOptions, UnwrapOptions
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def run(options: argparse.Namespace) -> int:
 def _read(options: argparse.Namespace, source: Path) -> MeshData:
     """Read the model within the limit of memory."""
     from quasiharmonic.io.formats.gltf.reader import read_gltf
-    from quasiharmonic.util.untrusted import use_bound
+    from quasiharmonic.io.untrusted import use_bound
 
     with use_bound(options.memory):
         if options.instances == "share":
@@ -255,7 +255,7 @@ def _edge_costs(mesh: MeshData, path: Path | None) -> Any:
 
     from quasiharmonic.apps.unwrapping.model_files import polygon_costs
     from quasiharmonic.geometry.mesh.topology import edge_keys
-    from quasiharmonic.io.lowlevel.textual import read_rows
+    from quasiharmonic.io.untrusted import read_rows
     from quasiharmonic.util.arrays import edge_names
 
     if path is None:
@@ -279,7 +279,7 @@ def _read_integers(path: Path | None, columns: int) -> Any:
     import numpy as np
 
     from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.lowlevel.textual import read_rows
+    from quasiharmonic.io.untrusted import read_rows
 
     if path is None:
         return None

@@ -1,4 +1,4 @@
-/* Kernels of `geometry/coarsening/prolongation.py`.
+/* Kernels of `geometry/prolongation.py`.
  *
  * The best position is chosen by comparison. All operations have the order of the NumPy version, so that both versions
  * choose the same position.

@@ -1,4 +1,4 @@
-/* Kernels of `geometry/coarsening/levels.py`: one round of coarsening.
+/* Kernels of `geometry/coarsening.py`: one round of coarsening.
  *
  * Each vertex has a star: for each triangle around it the two other corners, counterclockwise. Half-edges are never
  * sorted: whether two vertices are neighbours is looked up in a star, of six triangles as a rule.

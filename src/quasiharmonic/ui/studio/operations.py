@@ -1,0 +1,357 @@
+"""The steps that change a map. Each calls the library as the command does, and returns that command and a script.
+
+A step depends on the model, on its options and, if it starts from a map, on that map, which the page saves as
+`recipes.START`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from quasiharmonic.apps.atlas import island_functions as atlas
+from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, mirrored_islands
+from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, MappedIsland, each_island
+from quasiharmonic.apps.atlas.seam_cuts import cut_along, cut_apart
+from quasiharmonic.apps.uv_repair import repair
+from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS, smooth
+from quasiharmonic.geometry.curves import BoundaryCurves
+from quasiharmonic.geometry.exact.certificate import certify
+from quasiharmonic.geometry.mesh.topology import boundary_edges, edges, trace_loops
+from quasiharmonic.io import MeshData, read_mesh
+from quasiharmonic.io.objects import as_seamed_mesh
+from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
+from quasiharmonic.problem import Problem
+from quasiharmonic.problem.diagnosis import diagnose
+from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.solver.mapping import solve
+from quasiharmonic.targets import filled, outline_curves
+from quasiharmonic.targets.boundary.boundary_to import find_corner_vertices, fit_boundary, fix_in_place
+from quasiharmonic.targets.boundary.corner_pins import CornerSpec
+from quasiharmonic.targets.cuts.find import find_cuts
+from quasiharmonic.ui.studio import recipes
+from quasiharmonic.ui.studio.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Script, Source, public
+from quasiharmonic.ui.studio.state import IslandState, SessionState
+from quasiharmonic.ui.studio.validation import Outline, RequestError
+from quasiharmonic.util.arrays import IntArray
+
+Callback = Callable[[Step], object] | None
+# Options of the smoothing after a search.
+_SMOOTHING = {"energy": "blend", "max_iterations": SMOOTHING_STEPS}
+
+
+class Interrupted(KeyboardInterrupt):
+    """A step was interrupted; ``mesh`` has the best map so far."""
+
+    def __init__(self, mesh: SeamedMesh) -> None:
+        super().__init__()
+        self.mesh = mesh
+
+
+def find_source(state: SessionState, *, with_map: bool) -> Source:
+    """Return the file from which a step starts; ``with_map`` if the step depends on the current map."""
+    if state.sheet.is_file and state.from_file and (state.recipe.of_file or not with_map):
+        return Source(state.sheet.name, None)
+    return make_start(state.mesh)
+
+
+def make_start(mesh: SeamedMesh) -> Source:
+    """Return a file with a map that the page saves."""
+    return Source(START, MeshData(mesh.V, mesh.F, vt=mesh.uv, FT=None if mesh.uv is None else mesh.FT))
+
+
+def saved_start(mesh: SeamedMesh) -> Recipe:
+    """Return the recipe of a map that no step makes: the file with it."""
+    source = make_start(mesh)
+    script = Script()
+    script.let("mesh", public(as_seamed_mesh)(source.name))
+    return Recipe(f"qhm check {source.name}", str(script), source.start)
+
+
+def choose(state: SessionState) -> list[int] | None:
+    """Return the selected islands; None if these are all."""
+    return None if len(state.selected) == len(state.islands) else list(state.selected)
+
+
+def map_to_outline(
+    state: SessionState,
+    outline: Outline,
+    corners: Sequence[tuple[int, int]] | Literal["auto"] = (),
+    callback: Callback = None,
+) -> SessionState:
+    """Map the boundaries of the selected islands to an outline.
+
+    ``corners`` are boundary vertices of the first selected island and the outline's corners that they go to. "auto"
+    chooses vertices by angle; without corners arc length decides.
+    """
+    only, posed = choose(state), list[tuple[Problem, list[int]]]()
+    source = find_source(state, with_map=only is not None)
+    own = state.active.island.vertices
+    named = () if isinstance(corners, str) else tuple((int(own[v]), k) for v, k in corners)
+    spec = CornerSpec("auto" if isinstance(corners, str) else named) if corners else None
+    width = np.ptp(np.concatenate(outline.contours)[:, 0])
+
+    def lower(island: Island) -> MapResult:
+        asked = None if spec is None else spec.within(island.vertices)
+        copy = [contour + np.array([len(posed) * 1.05 * width, 0.0]) for contour in outline.contours]
+        fitted = fit_boundary(island.V, island.F, copy, corners=asked)
+        problem, onto = fitted.problem, filled(copy) if fitted.filled_holes else copy
+        posed.append((problem, find_corner_vertices(problem.fixed, problem.target, onto)))
+        return solve_smoothly(problem, callback)
+
+    mapped = each_island(state.mesh, lower, reflect=False, only=only)
+    word = corners if corners == "auto" else ",".join(f"{v}:{k}" for v, k in named) or None
+    chosen: dict[int, int] | str = corners if isinstance(corners, str) else dict(named)
+    options = {
+        "to": Given(outline, outline.to, {"to": outline.to}, outline.texts),
+        "corners": Given(chosen, chosen, {"corners": word}) if chosen else None,
+    }
+    recipe = _record_map(source, mapped, options, {}, only)
+    after = rebuild(state, mapped, replace(recipe, outline=outline.to))
+    for i, (k, (problem, found)) in enumerate(zip(state.selected, posed, strict=True)):
+        by_angle, given = corners == "auto", () if isinstance(corners, str) or i else tuple(corners)
+        one = replace(after.islands[k], outline=outline, corners=tuple(found), chosen=given, by_angle=by_angle)
+        after = after.with_island(k, one.with_problem(problem))
+    return after
+
+
+def map_in_place(
+    state: SessionState, start: SeamedMesh, only: list[int] | None, callback: Callback = None, follows: bool = False
+) -> SessionState:
+    """Map islands with their fixed vertices at the positions that they have in ``start``.
+
+    With ``follows``, ``start`` is injective. It is then improved if the search from scratch finds no map.
+    """
+    source = find_source(state, with_map=True) if start is state.mesh else make_start(start)
+    fixed = _list_fixed(state, only)
+    numbers = None if fixed is None else fixed.value
+
+    def lower(island: Island) -> MapResult:
+        return solve_smoothly(fix_in_place(island, numbers).problem, callback)
+
+    mapped = each_island(start, lower, only=only)
+    done = mapped.islands if only is None else [mapped.islands[k] for k in only]
+    anew = all(one.result.injective for one in done)
+    if anew or not follows:
+        recipe = _record_map(source, mapped, {"fixed": fixed}, {"fixed": fixed}, only)
+    else:
+        options = {**_SMOOTHING, "fixed": fixed}
+        mapped, recipe = recipes.perform(atlas.polish, start, source, "again.obj", options, only, callback)
+    recipe = replace(recipe, anew=anew, dragged=start is not state.mesh)
+    return rebuild(state, mapped, recipe, keep=("pins", "corners"))
+
+
+def _record_map(
+    source: Source, mapped: MappedAtlas, options: dict[str, Any], held: dict[str, Any], only: list[int] | None
+) -> Recipe:
+    """Return the recipe of a search for maps with ``options``; small injective maps are smoothed then.
+
+    ``held`` are the options of the smoothing that fix vertices.
+    """
+    script, chosen = Script(), list(range(len(mapped.islands))) if only is None else only
+    mesh = script.let("mesh", public(atlas.injective_map)(source.name, **options, islands=only).mesh)
+    found = [mapped.islands[k] for k in chosen]
+    small = [one.result.injective and len(one.triangles) <= LARGEST_SMOOTHED for one in found]
+    if any(small):
+        some = only if all(small) else [k for k, smoothed in zip(chosen, small, strict=True) if smoothed]
+        script.let("mesh", public(atlas.polish)(mesh, **held, **_SMOOTHING, islands=some).mesh)
+    return recipes.record_call("map", source, "again.obj", options, script, only)
+
+
+def polish_islands(state: SessionState, energy: str, slide: bool, callback: Callback = None) -> SessionState:
+    """Lower an energy of the selected islands until it converges."""
+    only, source = choose(state), find_source(state, with_map=True)
+    outline = state.active.outline if slide and len(state.islands) == 1 else None
+    curves = slide if outline is None else _sliding_curves(outline)
+    options = {"energy": energy, "slide": curves, "fixed": _list_fixed(state, only, slide=slide)}
+    mapped, recipe = recipes.perform(atlas.polish, state.mesh, source, "again.obj", options, only, callback)
+    recipe = replace(recipe, outline=None if outline is None else outline.to)
+    return rebuild(state, mapped, recipe, keep=("pins", "corners", "outline", "chosen", "by_angle"))
+
+
+def _sliding_curves(outline: Outline) -> Given:
+    """Return the curves of an outline, for a boundary that slides."""
+    code = public(BoundaryCurves)(public(outline_curves)(outline.to))
+    return Given(BoundaryCurves(outline.curves()), code, {"slide": True, "to": outline.to}, outline.texts)
+
+
+def flatten_islands(state: SessionState, callback: Callback = None) -> SessionState:
+    """Flatten the selected islands with free boundaries; all of them along new seams if the user drew some."""
+    if state.drawn is not None:
+        return _flatten_along(state, state.drawn, callback)
+    mesh, only = state.mesh, choose(state)
+    pins = _list_pins(state, state.selected)
+    source = find_source(state, with_map=only is not None or pins is not None)
+    cut = only is None and not all(is_flattenable(one.island) for one in state.islands)
+    if not cut:
+        mapped, recipe = recipes.perform(atlas.flatten, mesh, source, "flat.obj", {"fixed": pins}, only, callback)
+        return rebuild(state, mapped, recipe, keep=("pins",))
+    script = Script()
+    cuts = _record_cut(state, source, script, script.let("mesh", public(as_seamed_mesh)(source.name)))
+    script.let("mesh", public(atlas.flatten)(cuts).mesh)
+    mapped = atlas.flatten(cut_apart(mesh, polygons=_polygons(state, source), disks_too=True), callback=callback)
+    recipe = recipes.record_call("flatten", source, "flat.obj", {}, script, words=["--cut"])
+    return replace(rebuild(state, mapped, recipe), from_file=False)
+
+
+def _list_pins(state: SessionState, islands: Sequence[int]) -> Given | None:
+    """Return the pins of some islands, in the surface's numbering; None if there are none."""
+    pins = [int(state.islands[k].island.vertices[v]) for k in islands for v in state.islands[k].pins]
+    return recipes.saved_rows(FIXED, "fixed", np.array(pins)) if pins else None
+
+
+def repair_islands(state: SessionState, callback: Callback = None) -> SessionState:
+    """Make inverted triangles positive; boundaries, pins, and all vertices that need not move keep their positions."""
+    source, mesh = find_source(state, with_map=True), state.mesh
+    options = {"fixed": _list_pins(state, range(len(state.islands)))}
+    assert mesh.uv is not None
+    result = repair(mesh.V, mesh.F, mesh.uv, FT=mesh.FT, callback=callback, **recipes.values(options))
+    script = Script()
+    script.let("mesh", public(repair)(source.name, **options).mesh)
+    recipe = recipes.record_call("repair", source, "repaired.obj", options, script)
+    after = as_it_is(state, result.mesh, recipe, keep=("pins",))
+    for k, (one, done) in enumerate(zip(after.islands, result.islands, strict=False)):
+        if one.result is not None and done.diagnosis is not None:
+            after = after.with_island(k, replace(one, result=replace(one.result, diagnosis=done.diagnosis)))
+    return after
+
+
+def is_flattenable(island: Island) -> bool:
+    """Whether an island has a boundary and no handle."""
+    found, n = edges(island.F, len(island.vertices)), len(island.vertices)
+    loops = len(trace_loops(found.boundary))
+    return loops > 0 and n - len(found.interior) - len(found.boundary) + len(island.F) == 2 - loops
+
+
+def solve_smoothly(problem: Problem, callback: Callback) -> MapResult:
+    """Solve a problem as ``qhm map`` does; the result has a diagnosis if no bijective map was found."""
+    result = solve(problem, max_iterations=2000, callback=callback)
+    if result.status is Status.INJECTIVE:
+        result = smooth(problem, result, callback=callback)
+    interrupted = result.status is Status.INTERRUPTED
+    if not interrupted and not result.certificate.bijective and result.diagnosis is None:
+        result = replace(result, diagnosis=diagnose(problem))
+    return result
+
+
+def rebuild(state: SessionState, mapped: MappedAtlas, recipe: Recipe, keep: Collection[str] = ()) -> SessionState:
+    """Return the state after a step; islands that are the same keep the constraints named in ``keep``.
+
+    Islands that were not selected and have not moved are unchanged. All islands are selected if their number changes.
+    """
+    if any(one.result.status is Status.INTERRUPTED for one in mapped.islands):
+        raise Interrupted(mapped.mesh)
+    selected = state.selected if len(mapped.islands) == len(state.islands) else tuple(range(len(mapped.islands)))
+    islands = []
+    for k, (island, one) in enumerate(zip(mapped.mesh.islands, mapped.islands, strict=True)):
+        before = state.islands[k] if k < len(state.islands) else None
+        same = before is not None and np.array_equal(before.island.F, island.F)
+        if before is not None and same and k not in selected and np.array_equal(island.uv, before.island.uv):
+            islands.append(before)
+            continue
+        if np.isnan(island.uv).any():
+            islands.append(IslandState(island))
+            continue
+        # The atlas may have shifted an island after it was mapped.
+        result = one.result
+        uv = island.uv * MIRROR if one.mirrored else island.uv
+        if not np.array_equal(uv, result.uv):
+            result = replace(result, uv=uv, certificate=certify(island.F, uv))
+        new = IslandState(island, one.mirrored, result)
+        if same:
+            new = replace(new, **{name: getattr(before, name) for name in keep})
+        islands.append(fix_where_it_is(new))
+    return replace(state, mesh=mapped.mesh, islands=tuple(islands), recipe=recipe, selected=selected, drawn=None)
+
+
+def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, keep: Collection[str] = ()) -> SessionState:
+    """Return the state with the map of a mesh, like `rebuild`."""
+    done = []
+    for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
+        uv = island.uv * MIRROR if mirrored else island.uv
+        found = certify(island.F, uv)
+        result = MapResult(uv=uv, status=Status.INJECTIVE if found.injective else Status.STALLED, certificate=found)
+        done.append(MappedIsland(island.triangles, mirrored, result))
+    return rebuild(state, MappedAtlas(mesh, tuple(done)), recipe, keep)
+
+
+def fix_where_it_is(one: IslandState) -> IslandState:
+    """Return an island whose boundary and pins are fixed at their positions in its map."""
+    assert one.result is not None
+    edge = np.unique(boundary_edges(one.island.F, len(one.island.vertices)))
+    fixed = np.union1d(edge, np.array(one.pins, dtype=np.int64))
+    return replace(one, fixed=fixed, target=one.result.uv[fixed])
+
+
+def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> Given | None:
+    """Return the fixed vertices of the selected islands, in the surface's numbering; None if these are the boundary.
+
+    With ``slide``, only the pins are fixed.
+    """
+    chosen = state.islands if only is None else [state.islands[k] for k in only]
+    if not any(one.pins for one in chosen):
+        return None
+    rows = []
+    for one in chosen:
+        boundary = boundary_edges(one.island.F, len(one.island.vertices))[: 0 if slide else None]
+        rows.append(one.island.vertices[np.union1d(boundary, np.array(one.pins, int))])
+    return recipes.saved_rows(FIXED, "fixed", np.unique(np.concatenate(rows)))
+
+
+def _polygons(state: SessionState, source: Source) -> Any:
+    return state.sheet.mesh.polygons if source.start is None else None
+
+
+def _record_cut(state: SessionState, source: Source, script: Script, mesh: Code) -> Code:
+    """Append to a script that a mesh is cut as ``--cut`` does, and return the variable of the mesh."""
+    inside = None
+    if _polygons(state, source) is not None:
+        inside = script.let("inside", public(read_mesh)(source.name).polygons.diagonals(mesh.F))
+    cuts = public(find_cuts)(mesh.V, mesh.F, edges=mesh.seams, forbidden_edges=inside)
+    return script.let("mesh", mesh.cut(cuts))
+
+
+def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> SessionState:
+    """Flatten the whole surface, cut along the seams that the user drew, and where this is not enough."""
+    surface = state.sheet.surface
+    source = Source(state.sheet.name, None) if state.sheet.is_file else make_start(SeamedMesh(surface.V, surface.F))
+    polygons = _polygons(state, source)
+    mesh = SeamedMesh(surface.V, surface.F)
+    if len(drawn):
+        mesh = cut_along(mesh, drawn, polygons=polygons)
+    cut = not all(is_flattenable(island) for island in mesh.islands)
+    if cut:
+        mesh = cut_apart(mesh, polygons=polygons, disks_too=True)
+    mapped = atlas.flatten(mesh, callback=callback)
+    saved = recipes.saved_rows(SEAMS, "seams", drawn)
+    script = Script()
+    code = script.let("mesh", public(as_seamed_mesh)(source.name))
+    code = script.let("mesh", public(SeamedMesh)(code.V, code.F))
+    if len(drawn):
+        code = script.let("mesh", code.cut(saved.code))
+    if cut:
+        code = _record_cut(state, source, script, code)
+    script.let("mesh", public(atlas.flatten)(code).mesh)
+    words = {"seams": SEAMS if len(drawn) else "none", "cut": cut}
+    options = {"seams": replace(saved, words=words, texts=saved.texts if len(drawn) else {})}
+    recipe = recipes.record_call("flatten", source, "flat.obj", options, script)
+    after = rebuild(state, mapped, recipe)
+    return replace(after, from_file=False, selected=tuple(range(len(mapped.islands))))
+
+
+def require_map(state: SessionState) -> None:
+    """Raise RequestError unless the selected islands have maps."""
+    if any(state.islands[k].result is None for k in state.selected):
+        raise RequestError("there is no map yet: press Unwrap or Flatten first")
+
+
+def require_injective(state: SessionState) -> None:
+    """Raise RequestError if the map of a selected island has inverted triangles."""
+    require_map(state)
+    bad = [k for k in state.selected if not state.islands[k].injective]
+    if bad:
+        which = "the map has" if len(state.islands) == 1 else f"island {bad[0]} has"
+        raise RequestError(f"{which} inverted triangles: press Repair, or undo")
