@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import unwrap
+from quasiharmonic.apps.unwrapping.chart_search import Workers
+from quasiharmonic.apps.unwrapping.coarse_search import CoarseSearch, cut_into_charts
+from quasiharmonic.geometry.mesh.splitting import split_parts
 from quasiharmonic.surfaces import starfish
+from quasiharmonic.targets.cuts.shortening import cut_by_levels
 from shared.hinges import stretches
 
 V, F = starfish(5, 30)  # 5,402 vertices, more than the search takes at once
@@ -45,3 +49,31 @@ def test_seams_and_charts_that_are_demanded_need_no_coarse_search(result):
     assert kept.certificate.bijective
     assert (kept.seams == np.sort(seam)).all(axis=1).any()
     assert unwrap(V, F, max_charts=2).n_charts <= 2
+
+
+@pytest.mark.long
+def test_a_coarse_mesh_that_is_large_is_searched_on_a_coarser_one():
+    W, T = starfish(5, 60)
+    search, sizes = CoarseSearch(1.5, 0.1, Workers(1, None), W), []
+
+    def find(graph, vertices, rounds):
+        sizes.append(graph.n)
+        return search(graph, vertices, rounds)
+
+    seams = cut_by_levels(W, T, None, find, 3, goal=len(W) // 3, sweeps=3)
+    assert 5_000 < sizes[0] < len(W) / 2
+    parts = split_parts(T, np.arange(len(T)), seams, len(W))
+    assert 1 < len(parts) <= 2 * unwrap(*starfish(5, 12)).n_charts + 2
+    assert sum(len(rows) for rows, _, _ in parts) == len(T)
+
+
+def test_a_surface_without_interior_vertices_has_no_coarser_mesh():
+    k = np.arange(3_000)
+    side = np.stack([np.cos(k / 50), np.sin(k / 50), k / 500], axis=1)
+    W = np.concatenate([side, side + np.array([0, 0, 0.02])])
+    one, other = k[:-1], k[:-1] + len(k)
+    T = np.concatenate([np.stack([one, one + 1, other], axis=1), np.stack([one + 1, other + 1, other], axis=1)])
+    (chart,) = cut_into_charts(
+        W, T, np.empty((0, 2), dtype=np.int64), np.ones(T.shape), 0.1, CoarseSearch(1.5, 0.1, Workers(1, None), W)
+    )
+    assert len(chart.F) == len(T)

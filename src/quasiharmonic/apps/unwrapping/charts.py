@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
-from quasiharmonic.apps.unwrapping.coarse_search import CoarseSearch
+from quasiharmonic.apps.unwrapping.coarse_search import CoarseSearch, cut_into_charts
 from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
 from quasiharmonic.apps.unwrapping.draft import Draft
 from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
@@ -27,7 +27,6 @@ from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.splitting import fans, split_parts
 from quasiharmonic.geometry.mesh.topology import are_sides, boundary_edges
-from quasiharmonic.targets.cuts.find import find_cuts_by
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, mark, repeat_each, scale_to_unit
 
 #: Default of ``max_stretch``.
@@ -114,8 +113,8 @@ def find_charts(
         working, rest = _keep_parts(V, F, np.flatnonzero(~exact), given, cost, uv)
     min_gain = _MIN_GAIN if uv_cuts is None else np.inf
     coarse = uv_cuts is None and max_charts is None and not given.size
-    search_first = partial(CoarseSearch, max_stretch, workers, V) if coarse else None
-    cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain, search_first=search_first)
+    make = partial(CoarseSearch, max_stretch, min_gain, workers) if coarse else None
+    cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain, make=make)
     draft.charts = [*charts]
     total = surface_area(V, F)
     divisible = None if max_charts is None else max_charts - len(charts)
@@ -254,9 +253,9 @@ def _cut(
     given: IntArray,
     cost: FloatArray,
     min_gain: float,
-    search_first: Callable[[IntArray], CoarseSearch] | None,
+    make: Callable[[FloatArray], CoarseSearch] | None,
 ) -> list[WorkingChart]:
-    """Cut triangles into disks, or with ``search_first`` large surfaces into charts; return charts without maps.
+    """Cut triangles into disks, or with ``make`` large surfaces into charts.
 
     ``given`` cuts are demanded.
     """
@@ -264,21 +263,17 @@ def _cut(
     there = given[are_sides(given, F[rows], n)]
     vertices = np.flatnonzero(mark(n, F[rows]))
     own = invert_indices(n, vertices)[F[rows]]
-    coarse = None if search_first is None else search_first(vertices)
-    cut = vertices[
-        find_cuts_by(
-            V[vertices],
-            own,
-            np.searchsorted(vertices, there),
-            cost[rows],
-            min_gain if len(there) else _MIN_GAIN,
-            coarse,
-        )
-    ]
-    parts = split_parts(F[rows], rows, cut, n)
-    charts = [WorkingChart(of, origin, V[origin], own, cost[of]) for of, own, origin in parts]
-    if coarse is not None:
-        coarse.start(charts)
+    gain = min_gain if len(there) else _MIN_GAIN
+    charts = cut_into_charts(
+        V[vertices],
+        own,
+        np.searchsorted(vertices, there),
+        cost[rows],
+        gain,
+        None if make is None else make(V[vertices]),
+    )
+    for chart in charts:
+        chart.triangles, chart.vertices = rows[chart.triangles], vertices[chart.vertices]
     return charts
 
 

@@ -6,7 +6,9 @@ give the rotations of their triangles. The triangles near seams get theirs by un
 is fitted to the rotated triangles [1]_, then to the nearest ones that are stretched little, which is repeated. All
 systems have one unknown per vertex and the same matrix. Triangles that collapse or invert meanwhile are rotated anew,
 as their neighbours unfold. The surroundings of the few triangles that stay inverted are mapped by `injective_map`. A
-map whose boundary meets itself is not used.
+map whose boundary meets itself at more than a few places is not used.
+
+The coarse mesh of a huge surface is large, and searched in the same way on a coarser one.
 
 References
 ----------
@@ -30,6 +32,7 @@ from quasiharmonic.geometry.mesh.splitting import split_parts
 from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.targets.cuts.find import find_cuts_by
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at, to_complex, to_points
 
@@ -45,24 +48,30 @@ _PERMITTED = 0.5
 _LEAST_RATIO = 0.15
 # Maps with a larger share of inverted triangles are not repaired.
 _FEW = 0.01
+# Maps with more crossings of their boundary than this share of its edges are not used.
+_FEW_CROSSINGS = 0.01
+# A coarse mesh with a larger share of the vertices is cut without a coarser one.
+_LARGEST_SHARE = 0.5
 _NO_CUT = np.empty((0, 2), dtype=np.int64)
 
 
 class CoarseSearch:
-    """A search for charts on the coarse mesh of a surface; ``names`` (m,) are its part's vertices of ``V`` (n, 3)."""
+    """A search for charts on the coarse mesh of a surface with vertices ``V`` (n, 3)."""
 
-    def __init__(self, bound: float, workers: Workers, V: FloatArray, names: IntArray) -> None:
-        self._bound, self._workers, self._V, self._names = bound, workers, V, names
+    def __init__(self, bound: float, min_gain: float, workers: Workers, V: FloatArray) -> None:
+        self._bound, self._min_gain, self._workers, self._V = bound, min_gain, workers, V
         self._chart, self._place = np.full(len(V), -1), np.zeros(len(V), dtype=np.complex128)
         self._count = 0
 
-    def __call__(self, graph: EdgeGraph, cut: BoolArray, vertices: IntArray, rounds: list[list[Removal]]) -> BoolArray:
-        """Return the seams (e,) of the charts of a coarse mesh, given cuts that make disks."""
-        F, names = graph.F, self._names[vertices]
+    def __call__(self, graph: EdgeGraph, vertices: IntArray, rounds: list[list[Removal]]) -> BoolArray:
+        """Return the seams (e,) of the charts of a coarse mesh."""
+        F = graph.F
         cost = (graph.cost / edge_graph(graph.V, F).cost)[graph.side].T
-        parts = split_parts(F, np.arange(len(F)), graph.ends[cut], graph.n)
+        coarser = None
+        if graph.n <= _LARGEST_SHARE * len(self._V):
+            coarser = CoarseSearch(self._bound, self._min_gain, self._workers, graph.V)
         found = search_charts(
-            [WorkingChart(rows, origin, graph.V[origin], own, cost[rows]) for rows, own, origin in parts],
+            cut_into_charts(graph.V, F, _NO_CUT, cost, self._min_gain, coarser),
             self._bound,
             max_charts=None,
             total_area=surface_area(graph.V, F),
@@ -73,12 +82,12 @@ class CoarseSearch:
         seams = np.zeros(len(graph.ends), dtype=bool)
         for chart in found:
             assert chart.uv is not None
-            self._chart[names[chart.vertices]] = self._count
-            self._place[names[chart.vertices]] = to_complex(chart.uv)
+            self._chart[vertices[chart.vertices]] = self._count
+            self._place[vertices[chart.vertices]] = to_complex(chart.uv)
             self._count += 1
             for loop in chart.piece.loops:
                 seams[graph.numbers(*chart.vertices[np.stack([loop, np.roll(loop, -1)])])] = True
-        self._chart[names[graph.mark_vertices(seams)]] = -1
+        self._chart[vertices[graph.mark_vertices(seams)]] = -1
         self._prolong(rounds)
         return seams & ~graph.rim
 
@@ -90,7 +99,6 @@ class CoarseSearch:
         """Place vertices that the coarse mesh lacks, round after round, if their ring is in a chart."""
         for removals in reversed(rounds):
             for vertices, rings in removals:
-                vertices, rings = self._names[vertices], self._names[rings]
                 of = self._chart[rings]
                 inside = (of[:, 0] >= 0) & (of == of[:, :1]).all(axis=1)
                 vertices, rings = vertices[inside], rings[inside]
@@ -115,6 +123,21 @@ class CoarseSearch:
             )
         except NotPositiveDefinite:
             return
+
+
+def cut_into_charts(
+    V: FloatArray, F: IntArray, given: IntArray, cost: FloatArray, min_gain: float, coarse: CoarseSearch | None
+) -> list[WorkingChart]:
+    """Cut a surface into disks, or with ``coarse`` a large one into charts, which get initial maps where possible.
+
+    The ``given`` cuts (l, 2) are demanded.
+    """
+    cut = find_cuts_by(V, F, given, cost, min_gain, coarse)
+    parts = split_parts(F, np.arange(len(F)), cut, len(V))
+    charts = [WorkingChart(rows, origin, V[origin], own, cost[rows]) for rows, own, origin in parts]
+    if coarse is not None:
+        coarse.start(charts)
+    return charts
 
 
 def _fit(
@@ -158,7 +181,10 @@ def _fit(
         target = 0.5 * (larger + smaller) * rotation - p, 0.5 * (larger - smaller) * _direction(q) - q
         load = area * (target[0] * g + target[1] * g.conj())
         w = w + fitted.respond(sum_at(corners.ravel(), load.ravel(), n))
-    if not np.isfinite(w).all() or len(check_loops(chart.piece.loops, to_points(w))[0]):
+    if not np.isfinite(w).all():
+        return None
+    rim = sum(map(len, chart.piece.loops))
+    if len(check_loops(chart.piece.loops, to_points(w))[0]) > _FEW_CROSSINGS * rim:
         return None
     return _repair(chart, to_points(w), smaller <= 0)
 

@@ -34,8 +34,11 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 
-# A surface with more vertices is cut on a coarse mesh first.
-_LARGE = 5_000
+# A surface with more vertices is cut on a coarse mesh first, which has this number of vertices.
+_LARGE, _COARSE = 5_000, 4_000
+# A surface with more vertices is cut on a mesh with this share of them, smoothed by this number of sweeps, if its cuts
+# are found on a coarser mesh in turn.
+_HUGE, _SHARE, _SWEEPS = 160_000, 1 / 8, 3
 # `crease_costs` saves this share of the cost where the surface bends inwards by this angle or more.
 _SAVED, _CONCAVE = 0.75, np.pi / 3
 # Rings of triangles by which cuts may move on each finer mesh. Longer moves would shorten cuts at the expense of
@@ -134,12 +137,13 @@ def find_cuts_by(
     given: IntArray,
     costs: FloatArray | None,
     min_gain: float,
-    extend: Callable[[EdgeGraph, BoolArray, IntArray, list[list[Removal]]], BoolArray] | None = None,
+    find_coarse: Callable[[EdgeGraph, IntArray, list[list[Removal]]], BoolArray] | None = None,
 ) -> IntArray:
     """Find cuts as `find_cuts` does, from checked arrays.
 
-    On the coarse mesh of a large surface, ``extend`` replaces the cuts (e,) bool of an `EdgeGraph` by others, which are
-    carried to the surface. It also gets the indices (m,) of the graph's vertices, and the removed ones by rounds.
+    On the coarse mesh of a large surface, ``find_coarse`` may find other cuts (e,) bool of an `EdgeGraph`, which are
+    carried to the surface. It also gets the indices (m,) of the graph's vertices, and the removed ones by rounds. Its
+    coarse mesh may be large, too.
     """
     inner = manifold_edges(F, len(V)).interior
     # Open along the given edges. Surfaces that touch at a vertex are also separated.
@@ -153,13 +157,14 @@ def find_cuts_by(
             def find(
                 graph: EdgeGraph, some: IntArray, rounds: list[list[Removal]], names: IntArray = names
             ) -> BoolArray:
-                cut = _cut_part(graph, min_gain)
-                if extend is None:
-                    return cut
+                if find_coarse is None:
+                    return _cut_part(graph, min_gain)
                 own = [[Removal(names[gone], names[rings]) for gone, rings in removals] for removals in rounds]
-                return extend(graph, cut, names[some], own)
+                return find_coarse(graph, names[some], own)
 
-            cut = cut_by_levels(V[names], T, own, find, rings)
+            huge = find_coarse is not None and vertices.size > _HUGE
+            goal, sweeps = (int(_SHARE * vertices.size), _SWEEPS) if huge else (_COARSE, 0)
+            cut = cut_by_levels(V[names], T, own, find, rings, goal=goal, sweeps=sweeps)
         else:
             graph = edge_graph(V[names], T, own)
             cut = graph.ends[_cut_part(graph, min_gain)]

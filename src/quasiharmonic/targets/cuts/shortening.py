@@ -34,8 +34,6 @@ from quasiharmonic.util.progress import heartbeat
 _SAVES = 1e-6
 # Maximum number of rounds over all stretches. Most cuts converge after three.
 _ROUNDS = 8
-# Number of vertices of the coarse mesh.
-_COARSE = 4000
 # A stretch is exchanged for paths within this many rings of triangles around it.
 _RINGS = 5
 
@@ -279,6 +277,9 @@ def cut_by_levels(
     costs: FloatArray | None,
     find: Callable[[EdgeGraph, IntArray, list[list[Removal]]], BoolArray],
     rings: int,
+    *,
+    goal: int,
+    sweeps: int = 0,
 ) -> IntArray:
     """Cut a large connected surface.
 
@@ -294,6 +295,10 @@ def cut_by_levels(
         is at the mean position of the vertices that it represents.
     rings : int
         Distance to which cuts may move at each level, in rings of triangles.
+    goal : int
+        Number of vertices of the coarse mesh.
+    sweeps : int
+        Number of times that the coarse mesh is smoothed. Means of few positions make it rough.
 
     Returns
     -------
@@ -304,10 +309,10 @@ def cut_by_levels(
     rim = boundary_edges(F, n)
     fixed = np.zeros(n, dtype=bool)
     fixed[rim] = True
-    coarsening = coarsen(F, n, fixed, _COARSE)
+    coarsening = coarsen(F, n, fixed, goal)
     rim_keys = pair_keys(rim, n)
     factors = [None] * (len(coarsening.rounds) + 1) if costs is None else _vertex_costs(F, costs, coarsening.rounds, n)
-    means = _mean_positions(V, fixed, coarsening.rounds)
+    means = _smooth(_mean_positions(V, fixed, coarsening.rounds), coarsening.F, fixed, sweeps)
     vertices, graph = _make_subset(means, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
     cut = vertices[graph.ends[find(graph, vertices, coarsening.rounds)]]
     if not cut.size:
@@ -332,6 +337,17 @@ def _mean_positions(V: FloatArray, fixed: BoolArray, rounds: list[list[Removal]]
         for vertices, rings in removals:
             np.add.at(total, rings[:, 0], total[vertices])
     return np.where(fixed[:, None], V, total[:, :-1] / total[:, -1:])
+
+
+def _smooth(V: FloatArray, F: IntArray, fixed: BoolArray, sweeps: int) -> FloatArray:
+    """Move the vertices (n, d) of triangles that are not fixed halfway to the mean of their neighbours, repeatedly."""
+    tail, head, n = F.ravel(), F[:, (1, 2, 0)].ravel(), len(V)
+    degree = np.bincount(tail, minlength=n)
+    free = ~fixed & (degree > 0)
+    for _ in range(sweeps):
+        mean = np.stack([np.bincount(tail, x[head], n) for x in V.T], axis=1)[free] / degree[free, None]
+        V[free] = 0.5 * (V[free] + mean)
+    return V
 
 
 def _vertex_costs(F: IntArray, costs: FloatArray, rounds: list[list[Removal]], n: int) -> list[FloatArray]:
