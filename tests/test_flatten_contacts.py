@@ -160,7 +160,7 @@ def pinched():
     return np.vstack([V, V[pinch]]), np.where(fan & (pinch == F), len(V), F), [pinch, len(V)]
 
 
-@pytest.mark.parametrize("overlap", [0.0, 1e-12, 1e-3])
+@pytest.mark.parametrize("overlap", [0.0, 1e-12, 1e-3, 0.01])
 def test_copies_of_a_vertex_that_touch_are_pulled_apart(overlap):
     V, F, copies = pinched()
     uv = V.copy()

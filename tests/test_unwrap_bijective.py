@@ -13,7 +13,7 @@ from quasiharmonic.apps.unwrapping.chart_search import close_slits
 from quasiharmonic.apps.unwrapping.charts import Chart, find_charts
 from quasiharmonic.apps.unwrapping.layout import ChartLayout
 from quasiharmonic.apps.unwrapping.mending import mend_charts
-from quasiharmonic.apps.unwrapping.rounding import round_positions
+from quasiharmonic.apps.unwrapping.rounding import grid_unit, round_positions
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.results import UnwrapStatus
 from quasiharmonic.surfaces import disk, grid
@@ -193,6 +193,19 @@ def test_charts_with_thin_triangles_are_divided_into_few():
         )
     assert all_bijective(charts, scale)
     assert sum(len(chart.F) for chart in charts) == len(F)
+
+
+def test_a_chart_that_is_hardly_too_small_is_divided():
+    V, F = grid(4, 4)
+    V = np.pad(V, [(0, 0), (0, 1)])
+    chart = single_chart(V, F)
+    layout = place(chart, chart.uv)
+    # The triangles are hardly lower than the aim of the enlargement, which rounding would repeat forever.
+    height = np.ptp(chart.uv[:, 0]) / 4 / np.sqrt(2)
+    scale = 7.999 * grid_unit(layout.uv) / height
+    mended = mend_charts([chart], layout, np.array([0]), scale=scale, V=V, cost=np.ones(F.shape), bound=1.5)
+    assert len(mended) > 1
+    assert sum(len(one.F) for one in mended) == len(F)
 
 
 @pytest.mark.slow

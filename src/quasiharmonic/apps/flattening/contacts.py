@@ -38,7 +38,7 @@ _MAX_MEETINGS = 1000
 # Small overlaps have less than this number of pairs of edges. Their vertices move by these fractions of the smallest
 # height of their triangles, tried in turn.
 _MAX_PULLED = 10_000
-_SHARES = 0.0, *(1e-6 * 2.0**k for k in range(17))
+_SHARES = 0.0, *(1e-6 * 2.0**k for k in range(20))
 #: Half the gradients of the hat functions of a triangle v, a, b with a right angle at a and legs of length 1.
 HATS = np.array([0.5, -0.5 - 0.5j, 0.5j])
 

@@ -22,6 +22,8 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 # Enlarged triangles are at least this number of units high. Rounding can invert triangles that are lower than the
 # second number.
 _HEIGHT, _LEAST_HEIGHT = 8.0, 3.0
+# Charts are not enlarged by less than this factor: another fault than low triangles would remain.
+_LEAST_FACTOR = 1.1
 # Charts are enlarged to at most this number of units, which is 2⁻⁷ of the side of a texture.
 _LARGEST = 2.0**17
 
@@ -67,7 +69,7 @@ def mend_charts(
         rows, stored = np.unique(layout.F[chart.triangles], return_inverse=True)
         height = units * _heights(chart.uv[chart.F])
         factor = _HEIGHT / float(height.min()) if height.min() > 0 else np.inf
-        if 1 < factor <= _LARGEST / (units * np.ptp(chart.uv, axis=0).max()):
+        if _LEAST_FACTOR < factor <= _LARGEST / (units * np.ptp(chart.uv, axis=0).max()):
             done.append(_enlarge(chart, factor, V, cost))
         elif len(chart.F) == 1:
             done.append(_thicken(chart, _HEIGHT / units))
