@@ -352,8 +352,9 @@ def test_one_triangle():
         (TETRAHEDRON, [[0, 1, 4]], "vertex 4"),
         (TETRAHEDRON, [[0, 1, -1]], "vertex -1"),
         ([[0, 0], [np.nan, 0], [0, 1]], [[0, 1, 2]], "vertex 1"),
-        (TETRAHEDRON, [[0, 1, 1], [2, 2, 2]], "all 2 triangles are degenerate"),
-        ([[0, 0], [1, 1], [2, 2]], [[0, 1, 2]], "all 1 triangle"),
+        (TETRAHEDRON, [[0, 1, 1], [2, 2, 2]], "all 2 triangles are degenerate: each uses"),
+        (TETRAHEDRON, [[0, 1, 1]], "the only triangle is degenerate: it uses"),
+        ([[0, 0], [1, 1], [2, 2]], [[0, 1, 2]], "the only triangle is degenerate"),
         (np.zeros((3, 3)), [[0, 1, 2]], "degenerate"),
     ],
 )

@@ -18,6 +18,7 @@ from quasiharmonic.linsolve import (
     packages,
     rslab,
 )
+from quasiharmonic.util import progress
 from shared.matrices import ALL, UNLIMITED, both, diagonal, solve, solver_for, stiffness, upper
 
 
@@ -127,6 +128,26 @@ def test_the_pattern_is_analysed_by_the_first_factorisation(damaged, monkeypatch
         solver.factor(scale * np.array([2.0, -1.0, 2.0]))
         np.testing.assert_allclose(solver.solve([scale, scale]), [1.0, 1.0])
     assert calls == [1]
+
+
+@needs_rslab
+def test_a_factorisation_that_would_exceed_the_time_limit_is_not_begun(monkeypatch):
+    """The first factorisation takes about as long as the analysis before it."""
+    now, library = [0.0], rslab.library()
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    analyze = library.analyze
+
+    def analyse_slowly(*pattern, **settings):
+        now[0] += 60.0
+        return analyze(*pattern, **settings)
+
+    monkeypatch.setattr(library, "analyze", analyse_slowly)
+    solver = rslab.Rslab([0, 2, 3], [0, 1, 1])
+    with progress.time_limit(100.0) as limit, pytest.raises(KeyboardInterrupt):
+        solver.factor(np.array([2.0, -1.0, 2.0]))
+    assert limit.reached
+    solver.factor(np.array([2.0, -1.0, 2.0]))
+    np.testing.assert_allclose(solver.solve([1.0, 1.0]), [1.0, 1.0])
 
 
 def raising(error):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 
 import numpy as np
 import pytest
 
 from quasiharmonic import io, unwrap
-from quasiharmonic.apps.unwrapping.grown_charts import grow_charts
+from quasiharmonic.apps.unwrapping.grown_charts import count_charts, grow_charts
 from quasiharmonic.apps.unwrapping.result import UnwrapStatus
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.topology import boundary_loops
@@ -40,6 +41,29 @@ def test_grown_charts_are_bijective_with_little_stretch(bound):
         area = np.abs(np.linalg.det(sides[:, :2])).sum()
         doubled = np.linalg.norm(np.cross(*(V[F[:, k]] - V[F[:, 0]] for k in (1, 2))), axis=1)
         assert area == pytest.approx(doubled[chart.triangles].sum())
+
+
+@pytest.mark.parametrize("bound", [1.05, 1.5])
+def test_the_number_of_grown_charts_is_known_before(bound):
+    everything = np.ones(F.shape), NOWHERE, bound
+    count = len(grow_charts(V, F, np.arange(len(F)), *everything))
+    assert count_charts(V, F, *everything) == pytest.approx(count, rel=0.1)
+
+
+def test_time_to_pack_many_charts_is_reserved(monkeypatch):
+    module, seconds = sys.modules["quasiharmonic.apps.unwrapping.unwrap"], []
+    monkeypatch.setattr(module, "run_until", lambda left, compute: seconds.append(left))
+    loose = np.random.default_rng(0).normal(size=(3000, 3))
+    result = unwrap(loose, np.arange(3000).reshape(-1, 3), time_limit=60)
+    assert result.n_charts == 1000
+    assert seconds[0] < 59.6
+
+
+def test_the_limit_ends_work_on_the_shapes_of_many_charts():
+    chart = grow_charts(V, F, np.arange(len(F)), np.ones(F.shape), NOWHERE, 1.5)[0]
+    with progress.time_limit(0.0), pytest.raises(KeyboardInterrupt):
+        _ = chart.shape
+    assert chart.shape.area > 0
 
 
 def test_higher_bounds_need_fewer_grown_charts():

@@ -224,6 +224,12 @@ class LinearSolver(ABC):
         if values.shape != (self.nnz,):
             raise ValueError(f"values has shape {values.shape}; the analysed pattern has {self.nnz} entries")
         heartbeat(self._expected)
+        began = time.monotonic()
+        with self._lock:
+            self._require_open()
+            analysed_now = self.n > 0 and self._analyse_late()
+        if analysed_now:
+            heartbeat(time.monotonic() - began)
         with self._lock:
             self._require_open()
             self._ready = False
@@ -316,6 +322,10 @@ class LinearSolver(ABC):
     @abstractmethod
     def _analyse(self) -> None:
         """Find an ordering for the pattern; called once, with n > 0."""
+
+    def _analyse_late(self) -> bool:
+        """Do the part of the analysis that the first factorisation needs; return whether there was one to do."""
+        return False
 
     @abstractmethod
     def _factor(self) -> None:

@@ -77,9 +77,13 @@ class Rslab(LinearSolver):
             lambda: library().analyze(pattern, path="ldlt", ordering=_ORDERING, nemin=nemin, threads=threads)
         )
 
+    def _analyse_late(self) -> bool:
+        if self._is_analysed:
+            return False
+        self._symbolic, self._is_analysed = self._find_symbolic(), True
+        return True
+
     def _factor(self) -> None:
-        if not self._is_analysed:
-            self._symbolic, self._is_analysed = self._find_symbolic(), True
         self._numeric = None  # releases memory for the next factor
         self._numeric = self._try(lambda: self._symbolic.factor(self._values)) if self._symbolic else None
         if self._numeric is None:

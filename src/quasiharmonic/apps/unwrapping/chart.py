@@ -11,6 +11,7 @@ from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.progress import heartbeat
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,7 @@ class Chart:
     @cached_property
     def shape(self) -> Shape:
         """The part of the plane that the chart covers."""
+        heartbeat()
         return make_shape(self.uv, self.F)
 
     @property

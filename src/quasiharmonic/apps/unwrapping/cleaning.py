@@ -257,10 +257,8 @@ def clean(
     collapsed = np.flatnonzero(are_collapsed(joint[F]) & apart)
     if degenerate.all():
         merged = f"; welding at distance {weld:g} merges corners of {collapsed.size}, choose a smaller distance"
-        raise ValueError(
-            f"all {count_of('triangle', 'triangles', len(F))} are degenerate: each uses a vertex twice or has no area"
-            + merged * bool(collapsed.size)
-        )
+        every = f"all {len(F)} triangles are degenerate: each" if len(F) > 1 else "the only triangle is degenerate: it"
+        raise ValueError(f"{every} uses a vertex twice or has no area" + merged * bool(collapsed.size))
     exclusion = exclude(points, joint[F], degenerate)
     rows = exclusion.triangles
     sheets = join_sheets(points, joint[F[rows]], F[rows], area[rows], thin[rows])

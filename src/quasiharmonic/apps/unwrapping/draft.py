@@ -9,7 +9,7 @@ import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart, keeps_bound
-from quasiharmonic.apps.unwrapping.grown_charts import grow_charts
+from quasiharmonic.apps.unwrapping.grown_charts import count_charts, grow_charts
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
 from quasiharmonic.apps.unwrapping.mirrored_charts import mirror_charts
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
@@ -75,8 +75,16 @@ class Draft:
         grown = np.ones(len(F), dtype=bool)
         for chart in found:
             grown[chart.triangles] = False
-        cut = cost <= DEMANDED_COST
-        if cuts is not None:
-            cut |= mark_sides(F, cuts, len(V))
-        found += grow_charts(V, F, np.flatnonzero(grown), cost, cut, bound)
+        found += grow_charts(V, F, np.flatnonzero(grown), cost, _find_seams(V, F, cost, cuts), bound)
         return sorted(found, key=lambda chart: int(chart.triangles[0])), grown
+
+
+def expect_charts(V: FloatArray, F: IntArray, cost: FloatArray, cuts: IntArray | None, bound: float) -> int:
+    """Return about how many charts `Draft.complete` makes if the search has none; for the arguments see there."""
+    return count_charts(V, F, cost, _find_seams(V, F, cost, cuts), bound)
+
+
+def _find_seams(V: FloatArray, F: IntArray, cost: FloatArray, cuts: IntArray | None) -> BoolArray:
+    """Return the sides (f, 3) that must be seams."""
+    cut: BoolArray = cost <= DEMANDED_COST
+    return cut if cuts is None else cut | mark_sides(F, cuts, len(V))

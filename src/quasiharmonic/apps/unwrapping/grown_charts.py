@@ -55,8 +55,7 @@ def grow_charts(
     if not rows.size:
         return []
     exponent = find_exponent(V)
-    corners = np.ldexp(V[F[rows]], -exponent)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    corners, cross = _find_corners(V, F[rows], exponent)
     label = _join(corners, F[rows], cross, cost[rows], cut[rows], bound)
     charts, left = list[Chart](), np.arange(len(rows))
     while left.size:
@@ -83,6 +82,18 @@ def grow_charts(
                 label[left[some]] = 2 * k + (steep[some] if 0 < steep[some].sum() < some.size else _halve(uv[some]))
         left = left[~good[component]]
     return charts
+
+
+def count_charts(V: FloatArray, F: IntArray, cost: FloatArray, cut: BoolArray, bound: float) -> int:
+    """Return about how many charts `grow_charts` makes of a whole surface, in a fraction of its time."""
+    corners, cross = _find_corners(V, F, find_exponent(V))
+    return int(np.unique(_join(corners, F, cross, cost, cut, bound)).size)
+
+
+def _find_corners(V: FloatArray, F: IntArray, exponent: int) -> tuple[FloatArray, FloatArray]:
+    """Return the corners (k, 3, 3) of triangles (k, 3), over a power of two, and normals of twice their area (k, 3)."""
+    corners = np.ldexp(V[F], -exponent)
+    return corners, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def _join(

@@ -17,7 +17,7 @@ from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
-from quasiharmonic.apps.unwrapping.draft import Draft
+from quasiharmonic.apps.unwrapping.draft import Draft, expect_charts
 from quasiharmonic.apps.unwrapping.hard_edges import reads_hard_edges
 from quasiharmonic.apps.unwrapping.layout import (
     ChartLayout,
@@ -53,10 +53,12 @@ from quasiharmonic.util.progress import reports_progress
 
 # Positions beyond this power of two, or all below its reciprocal, are scaled.
 _MAX_EXPONENT = 300
-# After a time limit, charts are completed, packed and certified in about this multiple of the time of the preparation.
+# After a time limit, charts are completed and certified in about this multiple of the time of the preparation.
 _RESERVED = 2.0
 # Then so many charts are packed by their shapes, and further ones as boxes.
 _PACKED_CLOSELY = MANY
+# Seconds in which a chart is packed. At most this share of the limit is reserved for that.
+_SECONDS_PER_CHART, _MOST_RESERVED = 4e-4, 0.5
 
 
 class UnwrapKeywords(TypedDict, total=False):
@@ -275,8 +277,13 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     # Beside kept charts, there is no telling how long charts may be.
     given = density if kept is None else None
     draft, grown, strips = Draft(), np.zeros(len(cleaned.F), dtype=bool), list[Strip]()
-    spent = time.perf_counter() - began
-    left = None if wanted.time_limit is None else wanted.time_limit - (1 + _RESERVED) * spent
+    left = None
+    if wanted.time_limit is not None:
+        spent = time.perf_counter() - began
+        count = expect_charts(points, cleaned.F, rules.cost, rules.uv_cuts, bound)
+        packing_time = min(_SECONDS_PER_CHART * count, _MOST_RESERVED * wanted.time_limit)
+        reserved = _RESERVED * spent + packing_time
+        left = wanted.time_limit - reserved - (time.perf_counter() - began)
     made = run_until(left, lambda: _make_charts(points, cleaned, rules, wanted, size, given, draft, report))
     ended = made is None
     if made is None:
@@ -390,7 +397,9 @@ def _make_charts(
         callback=report,
         jobs=wanted.jobs,
     )
-    charts = [*straight, *(replace(chart, triangles=np.flatnonzero(rest)[chart.triangles]) for chart in charts)]
+    if straight:
+        # Other charts stay, because they know their shapes.
+        charts = [*straight, *(replace(chart, triangles=np.flatnonzero(rest)[chart.triangles]) for chart in charts)]
     if rules.uv is not None:
         return sorted(charts, key=lambda chart: int(chart.triangles[0])), strips
     return divide(charts, points, rules.cost), strips
