@@ -25,7 +25,7 @@ class TestCommand:
         assert said.err == ""
         (stars / "a" / "input.obj").write_text("nonsense")
         assert main(["batch", str(stars), "-o", out]) == 1
-        assert "the others: 1 input cannot be used" in capsys.readouterr().out
+        assert "the others: 1 with unusable input" in capsys.readouterr().out
         assert main(["batch", str(stars / "b"), "-o", out, "-j", "1", "--flatten", "--energy", "mips"]) == 0
         assert "2 of 2 problems have a certified bijective map" in capsys.readouterr().out
         sliding = ["--polish", "mips", "--slide"]

@@ -127,7 +127,7 @@ class TestPage:
             assert b64decode(data).startswith(b"\x89PNG")
         assert len(set(pictures)) == 4
         assert "75.0 %" in read.text
-        assert "input cannot be used" in read.text
+        assert "with unusable input" in read.text
         assert str(source) in read.text
 
     def test_free_boundaries(self, tmp_path):
@@ -139,7 +139,7 @@ class TestPage:
         batch.run(tmp_path / "set", tmp_path / "out", batch.Settings(flatten=True), jobs=1)
         text = Reader(written(tmp_path, tmp_path / "out")).text
         assert "2 of 3 certified bijective" in text
-        assert "2 certified bijective, 1 input cannot be used" in text
+        assert "2 certified bijective, 1 with unusable input" in text
         assert "certified injective" not in text
         assert "Settings: flatten True" in text
         # The table alone gives the same count.

@@ -394,3 +394,10 @@ def test_a_changed_mesh_is_written_as_a_new_file(tmp_path):
     fewer = replace(mesh, F=mesh.F[:1], FT=mesh.FT[:1])
     io.write_mapped(tmp_path / "out.glb", fewer)
     np.testing.assert_array_equal(io.read_mesh(tmp_path / "out.glb").F, [[0, 1, 2]])
+
+
+def test_a_binary_file_without_its_json(tmp_path):
+    data = square().glb()
+    (tmp_path / "a.glb").write_bytes(data[:16] + b"XXXX" + data[20:])
+    with pytest.raises(MeshFileError, match="it has no JSON chunk"):
+        io.read_mesh(tmp_path / "a.glb")

@@ -32,7 +32,7 @@ OUTCOMES: dict[str, str] = {
     "not injective": "no injective map found",
     "bijective": "certified bijective",
     "not bijective": "no bijective map found",
-    "invalid": "input cannot be used",
+    "invalid": "with unusable input",
     "error": "unexpected error",
     "timeout": "over the time limit",
     "memory": "over the memory limit",

@@ -267,6 +267,8 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
         check_end(at + 8 + size, len(data))
         found.setdefault(name, data[at + 8 : at + 8 + size])
         at += 8 + size
+    if b"JSON" not in found:
+        raise ValueError("it has no JSON chunk")
     return found[b"JSON"], found.get(b"BIN\0")
 
 
