@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
+from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart, mirror_charts
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart, keeps_bound
 from quasiharmonic.apps.unwrapping.grown_charts import grow_charts
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
-from quasiharmonic.apps.unwrapping.mirrored_charts import mirror_charts
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.geometry.mesh.topology import mark_sides
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
