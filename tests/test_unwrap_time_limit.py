@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import io, unwrap
-from quasiharmonic.apps.unwrapping.grown_charts import grow_charts
+from quasiharmonic.apps.unwrapping.draft import grow_charts
 from quasiharmonic.apps.unwrapping.result import UnwrapStatus
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.topology import boundary_loops

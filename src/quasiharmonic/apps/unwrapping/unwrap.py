@@ -18,7 +18,6 @@ from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
 from quasiharmonic.apps.unwrapping.draft import Draft
-from quasiharmonic.apps.unwrapping.hard_edges import reads_hard_edges
 from quasiharmonic.apps.unwrapping.layout import (
     ChartLayout,
     LayoutChoice,
@@ -27,6 +26,7 @@ from quasiharmonic.apps.unwrapping.layout import (
 )
 from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
 from quasiharmonic.apps.unwrapping.mending import mend_charts
+from quasiharmonic.apps.unwrapping.model_files import reads_hard_edges
 from quasiharmonic.apps.unwrapping.placing import check_placing, number_tiles, place_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStep, find_status
 from quasiharmonic.apps.unwrapping.scenes import accepts_scene
