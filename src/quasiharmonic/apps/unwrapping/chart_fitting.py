@@ -222,11 +222,11 @@ def mend_charts(
             done.append(_thicken(chart, _HEIGHT / units))
         else:
             verdict = certify(stored.reshape(-1, 3), layout.uv[rows])
-            done += _divide(chart, verdict, height < _LEAST_HEIGHT, V, cost, bound)
+            done += _divide_faulty(chart, verdict, height < _LEAST_HEIGHT, V, cost, bound)
     return sorted(done, key=lambda chart: int(chart.triangles[0]))
 
 
-def _divide(
+def _divide_faulty(
     chart: Chart, verdict: Certificate, low: BoolArray, V: FloatArray, cost: FloatArray, bound: float
 ) -> list[Chart]:
     """Divide a chart so that triangles with faults are in charts of their own; ``low`` (k,) are triangles at risk."""

@@ -110,30 +110,13 @@ def develop_charts(
             model.join(weight, kept, *_ONLY_FORCED, check_wanted)
         if not pieces.count:
             return pieces.label >= 0, []
-    known: dict[int, Chart] = {}
-    found = [_list_charts(F, model, pieces, known)]
+    found = [model.list_charts()]
     for longest, loss in _ROUNDS:
         if loss > _SMALL_LOSS and (len(found[-1]) > MAX_COMPARED or (choose is not None and not choose.generous)):
             break
         model.join(weight, together, longest, loss, check_wanted)
-        found.append(_list_charts(F, model, pieces, known))
+        found.append(model.list_charts())
     return pieces.label >= 0, found[-1] if choose is None else choose.choose(found, V, cost)
-
-
-def _list_charts(F: IntArray, model: PaperModel, pieces: Pieces, known: dict[int, Chart]) -> list[Chart]:
-    """Return the joined pieces as charts; ``known`` are those with these labels before."""
-    order = np.argsort(pieces.label, kind="stable")
-    order = order[pieces.label[order] >= 0]
-    charts = []
-    for rows in np.split(order, np.flatnonzero(np.diff(pieces.label[order])) + 1):
-        label = int(pieces.label[rows[0]])
-        # A label keeps its triangles unless more are joined to them.
-        if label not in known or len(known[label].triangles) != rows.size:
-            own, corner = renumber(model.split(rows), F[rows])
-            uv = to_points(pieces.place[rows].ravel()[corner])
-            known[label] = Chart(rows, own, F[rows].ravel()[corner], uv, np.ones(rows.size), 0.0)
-        charts.append(known[label])
-    return charts
 
 
 class _Leaf:
@@ -190,6 +173,8 @@ class PaperModel:
         order = order[pieces.label[order] >= 0]
         parts = np.split(order, np.flatnonzero(np.diff(pieces.label[order])) + 1) if order.size else []
         self._charts = {k: _Leaf(rows, pieces.place[rows].ravel()) for k, rows in enumerate(parts)}
+        # The charts that were listed last, by label.
+        self._known: dict[int, Chart] = {}
         # Hinges between two charts, and how often each chart has changed.
         self._contacts: dict[int, dict[int, IntArray]] = {k: {} for k in self._charts}
         self._version = dict.fromkeys(self._charts, 0)
@@ -352,7 +337,7 @@ class PaperModel:
 
     def _is_simple(self, rows: IntArray) -> bool:
         """Whether some triangles, joined at the glued hinges, have boundaries that stay apart."""
-        own = self.split(rows)
+        own = self._split(rows)
         if self._closes_demanded(rows, own):
             return False
         uv = np.empty((int(own.max()) + 1, 2))
@@ -371,6 +356,22 @@ class PaperModel:
         tail, head = own.ravel()[place], own[:, (1, 2, 0)].ravel()[place]
         return bool((here & (tail[0] == head[1]) & (head[0] == tail[1])).any())
 
-    def split(self, rows: IntArray) -> IntArray:
+    def list_charts(self) -> list[Chart]:
+        """Return the joined pieces as charts, by their labels."""
+        pieces, known = self._pieces, self._known
+        order = np.argsort(pieces.label, kind="stable")
+        order = order[pieces.label[order] >= 0]
+        charts = []
+        for rows in np.split(order, np.flatnonzero(np.diff(pieces.label[order])) + 1):
+            label = int(pieces.label[rows[0]])
+            # A label keeps its triangles unless more are joined to them.
+            if label not in known or len(known[label].triangles) != rows.size:
+                own, corner = renumber(self._split(rows), self._F[rows])
+                uv = to_points(pieces.place[rows].ravel()[corner])
+                known[label] = Chart(rows, own, self._F[rows].ravel()[corner], uv, np.ones(rows.size), 0.0)
+            charts.append(known[label])
+        return charts
+
+    def _split(self, rows: IntArray) -> IntArray:
         """Return some triangles (k, 3) by vertices of their own, joined at the glued hinges only."""
         return fans(self._F[rows], ~self._joined_sides.reshape(-1, 3)[rows])[0]

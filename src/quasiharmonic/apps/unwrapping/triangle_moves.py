@@ -18,7 +18,7 @@ from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.targets.cuts.graph import edge_graph
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, to_complex, to_points
+from quasiharmonic.util.arrays import ComplexArray, IntArray, to_complex, to_points
 
 # Charts of at most this number of triangles, with at most this share of the area, are joined to others.
 _SMALL, _SHARE = 32, 0.003
@@ -108,8 +108,7 @@ def _mesh_sides(chart: WorkingChart) -> list[tuple[int, int]]:
 def _positions(chart: WorkingChart) -> ComplexArray:
     """Return the map (m,) of a chart, as complex numbers in the surface's unit of length."""
     assert chart.uv is not None
-    uv: FloatArray = np.ldexp(chart.uv, chart.piece.exponent)
-    return uv[:, 0] + 1j * uv[:, 1]
+    return to_complex(np.ldexp(chart.uv, chart.piece.exponent))
 
 
 def _join(large: WorkingChart, small: WorkingChart, i: int, j: int, bound: float) -> WorkingChart | None:
@@ -139,8 +138,7 @@ def _join(large: WorkingChart, small: WorkingChart, i: int, j: int, bound: float
         np.concatenate([large.F, number[small.F]])[order],
         np.concatenate([large.cost, small.cost])[order],
     )
-    z = np.ldexp(np.concatenate([z, w[new]]).view(np.float64), -joined.piece.exponent).view(np.complex128)
-    uv = np.column_stack([z.real, z.imag])
+    uv = np.ldexp(to_points(np.concatenate([z, w[new]])), -joined.piece.exponent)
     if not is_injective(joined.F, uv):
         return None
     joined.use(uv)
@@ -186,8 +184,7 @@ class _SeamedCharts:
         self.chart = np.repeat(np.arange(len(charts)), [len(chart.F) for chart in charts])
         self.cost = np.concatenate([chart.cost for chart in charts])
         self.changed = np.zeros(len(charts), dtype=bool)
-        unit = [np.ldexp(chart.uv, chart.piece.exponent) for chart in charts if chart.uv is not None]
-        self.z = to_complex(np.concatenate(unit))
+        self.z = np.concatenate([_positions(chart) for chart in charts])
         self.rims = [np.concatenate(chart.piece.loops) + first for chart, first in zip(charts, start, strict=False)]
         # The mesh of all charts without seams.
         _, first, own = np.unique(self.vertices, return_index=True, return_inverse=True)
