@@ -169,10 +169,8 @@ class PaperModel:
         self._joined_sides = hinges.mark_sides(pieces.glued, len(F)).ravel()
         self._side = np.sqrt(area / _EXPECTED)
         self._unit = _GAP * np.sqrt(area)
-        order = np.argsort(pieces.label, kind="stable")
-        order = order[pieces.label[order] >= 0]
-        parts = np.split(order, np.flatnonzero(np.diff(pieces.label[order])) + 1) if order.size else []
-        self._charts = {k: _Leaf(rows, pieces.place[rows].ravel()) for k, rows in enumerate(parts)}
+        groups = _group_by_label(pieces.label)
+        self._charts = {k: _Leaf(rows, pieces.place[rows].ravel()) for k, rows in enumerate(groups)}
         # The charts that were listed last, by label.
         self._known: dict[int, Chart] = {}
         # Hinges between two charts, and how often each chart has changed.
@@ -359,10 +357,8 @@ class PaperModel:
     def list_charts(self) -> list[Chart]:
         """Return the joined pieces as charts, by their labels."""
         pieces, known = self._pieces, self._known
-        order = np.argsort(pieces.label, kind="stable")
-        order = order[pieces.label[order] >= 0]
         charts = []
-        for rows in np.split(order, np.flatnonzero(np.diff(pieces.label[order])) + 1):
+        for rows in _group_by_label(pieces.label):
             label = int(pieces.label[rows[0]])
             # A label keeps its triangles unless more are joined to them.
             if label not in known or len(known[label].triangles) != rows.size:
@@ -375,3 +371,10 @@ class PaperModel:
     def _split(self, rows: IntArray) -> IntArray:
         """Return some triangles (k, 3) by vertices of their own, joined at the glued hinges only."""
         return fans(self._F[rows], ~self._joined_sides.reshape(-1, 3)[rows])[0]
+
+
+def _group_by_label(label: IntArray) -> list[IntArray]:
+    """Return the triangles (k,) with each label (f,) that is not negative, by ascending labels."""
+    order = np.argsort(label, kind="stable")
+    order = order[label[order] >= 0]
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if order.size else []
