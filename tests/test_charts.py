@@ -10,7 +10,7 @@ import pytest
 from quasiharmonic import certify, find_cuts
 from quasiharmonic.apps.unwrapping.chart_maps import EvenStretch, WorkingChart
 from quasiharmonic.apps.unwrapping.charts import find_charts
-from quasiharmonic.apps.unwrapping.joining import join_small_charts
+from quasiharmonic.apps.unwrapping.triangle_moves import join_small_charts
 from quasiharmonic.energies.derivatives import check_energy
 from quasiharmonic.surfaces import disk, grid, starfish
 from shared.closed_surfaces import torus

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 import hard_models as models
 from quasiharmonic.apps.atlas.packing.layout import estimate_use, find_layout
 from quasiharmonic.apps.atlas.packing.shapes import make_shape
+from quasiharmonic.apps.unwrapping.developed_charts import PaperModel
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, FLAT, find_hinges
-from quasiharmonic.apps.unwrapping.paper_joining import PaperModel
 from quasiharmonic.apps.unwrapping.pieces import find_pieces
 from shared.examples import examples
 from shared.hinges import edges_of, groups, unit_normals

@@ -9,7 +9,7 @@ import pytest
 
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
-from quasiharmonic.apps.unwrapping.teeth import move_teeth
+from quasiharmonic.apps.unwrapping.triangle_moves import move_teeth
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.surfaces import grid
 

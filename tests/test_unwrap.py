@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from quasiharmonic import inverted_triangles, unwrap
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
-from quasiharmonic.apps.unwrapping.layout import ChartLayout
-from quasiharmonic.apps.unwrapping.rounding import round_positions
+from quasiharmonic.apps.unwrapping.layout import ChartLayout, round_positions
 from quasiharmonic.apps.unwrapping.separation import separate
 from quasiharmonic.surfaces import annulus, grid, random_delaunay, starfish
 from shared.exact import exact_orientation

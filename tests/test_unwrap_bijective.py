@@ -8,12 +8,11 @@ import pytest
 import hostile_models
 from hostile_models import blocks, find_fault, split_edges
 from quasiharmonic import unwrap
+from quasiharmonic.apps.unwrapping.chart_fitting import mend_charts
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import close_slits
 from quasiharmonic.apps.unwrapping.charts import Chart, find_charts
-from quasiharmonic.apps.unwrapping.layout import ChartLayout
-from quasiharmonic.apps.unwrapping.mending import mend_charts
-from quasiharmonic.apps.unwrapping.rounding import grid_unit, round_positions
+from quasiharmonic.apps.unwrapping.layout import ChartLayout, grid_unit, round_positions
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.results import UnwrapStatus
 from quasiharmonic.surfaces import disk, grid

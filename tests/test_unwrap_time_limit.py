@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import io, unwrap
-from quasiharmonic.apps.unwrapping.grown_charts import count_charts, grow_charts
+from quasiharmonic.apps.unwrapping.draft import expect_charts, grow_charts
 from quasiharmonic.apps.unwrapping.result import UnwrapStatus
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.topology import boundary_loops
@@ -45,9 +45,9 @@ def test_grown_charts_are_bijective_with_little_stretch(bound):
 
 @pytest.mark.parametrize("bound", [1.05, 1.5])
 def test_the_number_of_grown_charts_is_known_before(bound):
-    everything = np.ones(F.shape), NOWHERE, bound
-    count = len(grow_charts(V, F, np.arange(len(F)), *everything))
-    assert count_charts(V, F, *everything) == pytest.approx(count, rel=0.1)
+    cost = np.ones(F.shape)
+    count = len(grow_charts(V, F, np.arange(len(F)), cost, NOWHERE, bound))
+    assert expect_charts(V, F, cost, None, bound) == pytest.approx(count, rel=0.1)
 
 
 def test_time_to_pack_many_charts_is_reserved(monkeypatch):

@@ -32,9 +32,8 @@ from quasiharmonic.apps.unwrapping.chart_maps import (
     guard_chart,
 )
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
-from quasiharmonic.apps.unwrapping.joining import join_small_charts
 from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
-from quasiharmonic.apps.unwrapping.teeth import move_teeth
+from quasiharmonic.apps.unwrapping.triangle_moves import join_small_charts, move_teeth
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys

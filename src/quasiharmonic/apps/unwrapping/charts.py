@@ -9,18 +9,16 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
+from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart, mirror_charts
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
 from quasiharmonic.apps.unwrapping.coarse_search import CoarseSearch, cut_into_charts
 from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
 from quasiharmonic.apps.unwrapping.draft import Draft
-from quasiharmonic.apps.unwrapping.flat_parts import lay_flat_parts
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.layout import LayoutChoice
-from quasiharmonic.apps.unwrapping.mirrored_charts import mirror_charts
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
-from quasiharmonic.apps.unwrapping.unfolding import unfold_small_components
+from quasiharmonic.apps.unwrapping.unrolling import lay_flat_parts, unfold_small_components
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import is_injective

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quasiharmonic.apps.unwrapping.exclusion import exclude
+from quasiharmonic.apps.unwrapping.degenerate_triangles import exclude, widen
 from quasiharmonic.apps.unwrapping.sheets import join_sheets
-from quasiharmonic.apps.unwrapping.widening import widen
 from quasiharmonic.geometry.mesh.splitting import find_representatives
 from quasiharmonic.geometry.mesh.topology import are_collapsed, boundary_edges, components, edge_keys, pair_keys
 from quasiharmonic.io.accepts_mesh import accepts_mesh

@@ -13,10 +13,9 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from quasiharmonic.apps.unwrapping.flat_parts import covers_once
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
-from quasiharmonic.apps.unwrapping.unrolling import lay_along, meet, spanning_links
+from quasiharmonic.apps.unwrapping.unrolling import covers_once, lay_along, meet, spanning_links
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes, surface_area
 from quasiharmonic.geometry.mesh.splitting import fans

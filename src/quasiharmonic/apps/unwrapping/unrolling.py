@@ -1,4 +1,8 @@
-"""Unroll developable pieces: lay one triangle after another into the plane, without stretch."""
+"""Lay parts of a surface into the plane without stretch: planar parts, and small closed components like paper models.
+
+All components are unfolded at once, because thousands of them would take minutes one by one. Their triangles are joined
+across the flattest edges, along a tree.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +10,21 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from quasiharmonic.apps.unwrapping.hinges import Hinges, ahead
-from quasiharmonic.geometry.mesh.reference import rest_frames
+from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.hinges import Hinges, ahead, find_hinges
+from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
+from quasiharmonic.geometry.exact.loops import simple_loops
+from quasiharmonic.geometry.mesh.reference import area_vectors, rest_frames
+from quasiharmonic.geometry.mesh.splitting import fans, renumber
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 #: Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
 SAME = 1e-3
+# Distance from the plane, relative to the part's size, up to which a part counts as planar.
+_FLAT = 1e-9
+# A small component has at most this number of triangles, and at most this share of the area.
+_SMALL, _SMALL_SHARE = 24, 0.01
 
 
 def spanning_links(first: IntArray, second: IntArray, rank: FloatArray, size: int) -> BoolArray:
@@ -72,3 +85,149 @@ def meet(place: ComplexArray, hinges: Hinges, chosen: IntArray) -> BoolArray:
     apart = np.maximum(np.abs(z[one] - z[ahead(other)]), np.abs(z[ahead(one)] - z[other]))
     same: BoolArray = apart <= SAME * hinges.length[chosen]
     return same
+
+
+def lay_flat_parts(V: FloatArray, F: IntArray, component: IntArray) -> tuple[BoolArray, FloatArray]:
+    """Lay out all parts that lie in a plane and do not overlap themselves.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+    F : (f, 3) int64
+        Triangles; parts have no common vertices.
+    component : (f,) int64
+        Part of each triangle; every number from 0 on occurs.
+
+    Returns
+    -------
+    flat : (c,) bool
+        Which parts are laid out.
+    uv : (n, 2) float64
+        Their positions, isometric; 0 elsewhere.
+    """
+    count = int(component.max(initial=-1)) + 1
+    first = np.unique(component, return_index=True)[1]
+    corners = V[F] - V[F[first, 0]][component][:, None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = np.zeros(count)
+        np.maximum.at(size, component, np.abs(corners).max(axis=(1, 2)))
+        corners /= np.where(size > 0, size, 1.0)[component][:, None, None]
+    along, across = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    cross = np.cross(along, across)
+    sums = [np.bincount(component, cross[:, k], minlength=count) for k in range(3)]
+    normal: FloatArray = np.stack(sums, axis=1).astype(np.float64)
+    length = np.linalg.norm(normal, axis=1)
+    normal = normal / np.where(length > 0, length, 1.0)[:, None]
+    height = np.abs((corners * normal[component][:, None]).sum(axis=2)).max(axis=1)
+    flat = (length > 0) & (size > 0)
+    flat[component[(height > _FLAT) | ~((cross * normal[component]).sum(axis=1) > 0)]] = False
+    # An orthonormal frame; the first axis is the first side of the part.
+    axis = along[first] - (along[first] * normal).sum(axis=1)[:, None] * normal
+    width = np.linalg.norm(axis, axis=1)
+    axis /= np.where(width > 0, width, 1.0)[:, None]
+    frame = np.stack([axis, np.cross(normal, axis)], axis=1)
+    local = np.einsum("fkx,fdx->fkd", corners, frame[component])
+    uv = np.zeros((len(V), 2))
+    uv[F] = np.where(flat, size, 0.0)[component][:, None, None] * local
+    return flat & covers_once(F, uv, component, flat), uv
+
+
+def covers_once(F: IntArray, uv: FloatArray, component: IntArray, candidates: BoolArray) -> BoolArray:
+    """Which of the candidate parts (c,) do not overlap themselves."""
+    good = candidates.copy()
+    good[component[inverted_triangles(F, uv)]] = False
+    if not good.any():
+        return good
+    loops = boundary_loops(F[good[component]], len(uv))
+    part = np.zeros(len(uv), dtype=np.int64)
+    part[F] = component[:, None]
+    owner = np.array([part[loop[0]] for loop in loops], dtype=np.int64)
+    number = np.bincount(owner, minlength=len(good))
+    # Positive triangles inside one simple loop cover it once.
+    single = number[owner] == 1
+    alone = [loop for loop, one in zip(loops, single.tolist(), strict=True) if one]
+    if alone:
+        good[owner[single]] = simple_loops(alone, uv)
+    for k in np.flatnonzero(good & (number > 1)).tolist():
+        used, own = np.unique(F[component == k], return_inverse=True)
+        good[k] = bool(certify(own.reshape(-1, 3), uv[used]).bijective)
+    return good
+
+
+def unfold_small_components(
+    V: FloatArray, F: IntArray, undivided: BoolArray, demanded: BoolArray
+) -> tuple[BoolArray, list[Chart]]:
+    """Unfold the small closed components of a surface that have no demanded cuts.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+    F : (f, 3) int64
+    undivided, demanded : (f, 3) bool
+        Sides across which triangles are joined first, such as those inside polygons, and sides that must be seams.
+
+    Returns
+    -------
+    mask : (f,) bool
+        The triangles of the components that do not overlap themselves when they are unfolded.
+    charts : list of Chart
+        One for each of these components.
+    """
+    mask, charts = np.zeros(len(F), dtype=bool), list[Chart]()
+    component = fans(F)[1]
+    chosen = np.bincount(component) <= _SMALL
+    if not chosen.any():
+        return mask, charts
+    area = np.linalg.norm(area_vectors(V, F), axis=1)
+    chosen &= np.bincount(component, area) <= _SMALL_SHARE * area.sum()
+    sides = edge_keys(F, F[:, (1, 2, 0)], len(V))
+    _, edge, times = np.unique(sides, return_inverse=True, return_counts=True)
+    chosen[component[((times[edge].reshape(sides.shape) < 2) | demanded).any(axis=1)]] = False
+    rows = np.flatnonzero(chosen[component])
+    if not rows.size:
+        return mask, charts
+    split, component, uv, good = _unfold(V, F[rows], undivided[rows])
+    order = np.argsort(component, kind="stable")
+    for k, some in enumerate(np.split(order, np.flatnonzero(np.diff(component[order])) + 1)):
+        if good[k]:
+            own, corner = renumber(split[some], F[rows[some]])
+            vertices = F[rows[some]].ravel()[corner]
+            charts.append(Chart(rows[some], own, vertices, uv[split[some].ravel()[corner]], np.ones(some.size), 0.0))
+    mask[rows[good[component]]] = True
+    return mask, charts
+
+
+def _unfold(V: FloatArray, F: IntArray, undivided: BoolArray) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+    """Unfold closed surfaces.
+
+    Parameters
+    ----------
+    V : (n, 3) float64
+    F : (f, 3) int64
+        Triangles of closed surfaces.
+    undivided : (f, 3) bool
+        Sides across which triangles are joined first, such as those inside polygons.
+
+    Returns
+    -------
+    split : (f, 3) int64
+        Triangles by vertices of the unfolded surfaces.
+    component : (f,) int64
+        Surface of each triangle, by first appearance.
+    uv : (m, 2) float64
+        Positions of the unfolded vertices.
+    good : (c,) bool
+        Which surfaces do not overlap themselves.
+    """
+    hinges = find_hinges(V, F)
+    bend = 1 - np.cos(hinges.angle)
+    bend[undivided.ravel()[hinges.one] | undivided.ravel()[hinges.other]] = -1.0
+    rank = np.empty(bend.size)
+    rank[np.argsort(bend, kind="stable")] = np.arange(1, bend.size + 1)
+    joined = spanning_links(hinges.first, hinges.second, rank, len(F))
+    split, component = fans(F, ~hinges.mark_sides(joined, len(F)))
+    place = lay_along(V, F, hinges.one[joined], hinges.other[joined], component)
+    uv = np.zeros((int(split.max()) + 1, 2))
+    flat = place.ravel()[np.unique(split.ravel(), return_index=True)[1]]
+    uv[:, 0], uv[:, 1] = flat.real, flat.imag
+    return split, component, uv, covers_once(split, uv, component, np.ones(int(component.max()) + 1, dtype=bool))

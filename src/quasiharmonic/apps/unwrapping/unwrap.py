@@ -13,21 +13,19 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY
 from quasiharmonic.apps.atlas.packing.pack import check_texture
-from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart, pair_charts
+from quasiharmonic.apps.unwrapping.chart_fitting import divide_long_charts, mend_charts
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
 from quasiharmonic.apps.unwrapping.draft import Draft, expect_charts
-from quasiharmonic.apps.unwrapping.hard_edges import reads_hard_edges
 from quasiharmonic.apps.unwrapping.layout import (
     ChartLayout,
     LayoutChoice,
     find_seams,
     join_charts,
 )
-from quasiharmonic.apps.unwrapping.long_charts import divide_long_charts
-from quasiharmonic.apps.unwrapping.mending import mend_charts
-from quasiharmonic.apps.unwrapping.mirrored_charts import pair_charts
+from quasiharmonic.apps.unwrapping.model_files import reads_hard_edges
 from quasiharmonic.apps.unwrapping.placing import check_placing, number_tiles, place_charts
 from quasiharmonic.apps.unwrapping.result import Miss, Stretch, UnwrapResult, UnwrapStep, find_status
 from quasiharmonic.apps.unwrapping.scenes import accepts_scene

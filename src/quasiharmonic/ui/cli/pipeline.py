@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
-    from quasiharmonic.apps.unwrapping.defective_charts import SetApart
+    from quasiharmonic.apps.unwrapping.chart_verdict import SetApart
     from quasiharmonic.geometry.exact.certificate import Certificate
     from quasiharmonic.io import MeshData
 
@@ -123,7 +123,7 @@ def certify_map(mesh: MeshData, *, precision: str = "float64", weld: bool | floa
     found = WrittenMap(V, F, uv, certify(F, uv), verdict, mesh.faces, find_bent(mesh, F, uv))
     if found.certificate.injective or mesh.vt is None:
         return found
-    from quasiharmonic.apps.unwrapping.defective_charts import certify_defective
+    from quasiharmonic.apps.unwrapping.chart_verdict import certify_defective
 
     charts = certify_defective(mesh.V, joined.F, uv[F])
     return found if charts is None else replace(found, verdict=charts[0], set_apart=charts[1])

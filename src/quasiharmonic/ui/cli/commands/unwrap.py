@@ -153,10 +153,10 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
     """Unwrap a mesh."""
     from quasiharmonic import io
-    from quasiharmonic.apps.unwrapping.hard_edges import find_hard_edges
     from quasiharmonic.apps.unwrapping.model_files import (
         add_map,
         corner_positions,
+        find_hard_edges,
         is_written,
         material_densities,
         statement_labels,

@@ -1,27 +1,148 @@
-"""Smooth the outlines of charts: teeth, triangles with two sides on a seam, move into the notch on its other side.
+"""Move triangles between charts: small charts join a neighbour, and teeth move into the notch across a seam.
 
-The seam then takes the third side, which is shorter. The triangle's corners are vertices of the other chart already, so
-its map only has to be free of overlaps there.
+A division that removes an overlap often cuts off a few triangles. They fit to another chart, or to another edge. Teeth
+are triangles with two sides on a seam, which then takes the third side, which is shorter. The triangle's corners are
+vertices of the other chart already, so its map only has to be free of overlaps there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from heapq import heapify, heappop, heappush
 
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
+from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.targets.cuts.graph import edge_graph
 from quasiharmonic.util.arrays import ComplexArray, IntArray, to_complex, to_points
 
+# Charts of at most this number of triangles, with at most this share of the area, are joined to others.
+_SMALL, _SHARE = 32, 0.003
+# Maximum number of edges of a chart that are tried, longest first.
+_TRIES = 12
 # The seam must become shorter by this share of the two sides.
 _SAVES = 0.02
 # No vertex of an outline may lie in a notch, or this close to it, relative to its height.
 _CLOSE = 0.05
+
+
+def join_small_charts(
+    charts: Sequence[WorkingChart], bound: float, total_area: float, check_wanted: Callable[[], object]
+) -> list[WorkingChart]:
+    """Join small charts to neighbours at one edge each.
+
+    Parameters
+    ----------
+    charts : sequence of WorkingChart
+        With bijective maps.
+    bound : float
+        Largest stretch of a triangle of a chart that is joined to another one.
+    total_area : float
+        Area of the surface.
+    check_wanted : callable
+        Called before each chart; may raise an exception.
+
+    Returns
+    -------
+    list of WorkingChart
+        All have bijective maps.
+    """
+    small = [k for k, chart in enumerate(charts) if _is_small(chart, total_area)]
+    if not small:
+        return list(charts)
+    owner = {side: k for k, chart in enumerate(charts) for side in _mesh_sides(chart)}
+    present: dict[int, WorkingChart] = dict(enumerate(charts))
+    for k in sorted(small, key=lambda k: len(charts[k].F)):
+        check_wanted()
+        chart = present[k]
+        if not _is_small(chart, total_area):
+            continue
+        tail, head = _sides(chart)
+        wanted = _find_demanded(chart)
+        length = np.linalg.norm(chart.V[tail] - chart.V[head], axis=1)
+        tries = 0
+        for i in np.argsort(-length, kind="stable").tolist():
+            if (int(tail[i]), int(head[i])) in wanted:
+                continue
+            other = owner.get((int(chart.vertices[head[i]]), int(chart.vertices[tail[i]])), k)
+            if other == k:
+                continue
+            joined = _join(present[other], chart, int(tail[i]), int(head[i]), bound)
+            if joined is not None:
+                present[other] = joined
+                del present[k]
+                owner.update((side, other) for side in _mesh_sides(chart))
+                break
+            tries += 1
+            if tries == _TRIES:
+                break
+    return list(present.values())
+
+
+def _is_small(chart: WorkingChart, total_area: float) -> bool:
+    return len(chart.F) <= _SMALL and chart.surface_area <= _SHARE * total_area
+
+
+def _find_demanded(chart: WorkingChart) -> set[tuple[int, int]]:
+    """Return the sides of triangles that must be seams, by their ends."""
+    demanded = chart.cost <= DEMANDED_COST
+    return set(zip(chart.F[demanded].tolist(), chart.F[:, (1, 2, 0)][demanded].tolist(), strict=True))
+
+
+def _sides(chart: WorkingChart) -> tuple[IntArray, IntArray]:
+    """Return the start and end vertices (k,) of the boundary edges, in the direction of the triangles."""
+    loops = chart.piece.loops
+    return np.concatenate(loops), np.concatenate([np.roll(loop, -1) for loop in loops])
+
+
+def _mesh_sides(chart: WorkingChart) -> list[tuple[int, int]]:
+    """Return the boundary edges as pairs of vertices of the mesh."""
+    tail, head = _sides(chart)
+    return list(zip(chart.vertices[tail].tolist(), chart.vertices[head].tolist(), strict=True))
+
+
+def _positions(chart: WorkingChart) -> ComplexArray:
+    """Return the map (m,) of a chart, as complex numbers in the surface's unit of length."""
+    assert chart.uv is not None
+    return to_complex(np.ldexp(chart.uv, chart.piece.exponent))
+
+
+def _join(large: WorkingChart, small: WorkingChart, i: int, j: int, bound: float) -> WorkingChart | None:
+    """Join a chart at its edge from i to j to another one; None if that stretches it too much, or causes an overlap."""
+    tail, head = _sides(large)
+    match = (large.vertices[tail] == small.vertices[j]) & (large.vertices[head] == small.vertices[i])
+    if not match.any():
+        return None
+    at = int(np.flatnonzero(match)[0])
+    z, w = _positions(large), _positions(small)
+    factor = (z[tail[at]] - z[head[at]]) / (w[j] - w[i])
+    scale = abs(factor)
+    if not max(scale, 1 / scale) * small.stretch.max() <= bound:
+        return None
+    w = z[head[at]] + factor * (w - w[i])
+    # Of the smaller chart, all vertices but the two ends of the edge are new.
+    number = np.empty(len(w), dtype=np.int64)
+    new = np.delete(np.arange(len(w)), [i, j])
+    number[new] = len(z) + np.arange(len(new))
+    number[i], number[j] = head[at], tail[at]
+    triangles = np.concatenate([large.triangles, small.triangles])
+    order = np.argsort(triangles)
+    joined = WorkingChart(
+        triangles[order],
+        np.concatenate([large.vertices, small.vertices[new]]),
+        np.concatenate([large.V, small.V[new]]),
+        np.concatenate([large.F, number[small.F]])[order],
+        np.concatenate([large.cost, small.cost])[order],
+    )
+    uv = np.ldexp(to_points(np.concatenate([z, w[new]])), -joined.piece.exponent)
+    if not is_injective(joined.F, uv):
+        return None
+    joined.use(uv)
+    return joined if joined.bijective else None
 
 
 def move_teeth(charts: Sequence[WorkingChart], bound: float) -> list[WorkingChart]:
@@ -63,8 +184,7 @@ class _SeamedCharts:
         self.chart = np.repeat(np.arange(len(charts)), [len(chart.F) for chart in charts])
         self.cost = np.concatenate([chart.cost for chart in charts])
         self.changed = np.zeros(len(charts), dtype=bool)
-        unit = [np.ldexp(chart.uv, chart.piece.exponent) for chart in charts if chart.uv is not None]
-        self.z = to_complex(np.concatenate(unit))
+        self.z = np.concatenate([_positions(chart) for chart in charts])
         self.rims = [np.concatenate(chart.piece.loops) + first for chart, first in zip(charts, start, strict=False)]
         # The mesh of all charts without seams.
         _, first, own = np.unique(self.vertices, return_index=True, return_inverse=True)
