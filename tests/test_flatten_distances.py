@@ -13,9 +13,9 @@ import pytest
 
 from quasiharmonic import Status, certify, distortion, flatten, keep_distances, surfaces
 from quasiharmonic.apps.flattening import free_boundary, piece
+from quasiharmonic.apps.flattening.coarse_distances import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.distances.distance_descent import DistanceEnergy, DistancePairs, lower_distance_error
-from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
+from quasiharmonic.apps.flattening.distance_descent import DistanceEnergy, DistancePairs, lower_distance_error
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
 from quasiharmonic.energies.distances import surface_distances
@@ -428,7 +428,7 @@ def test_ctrl_c_ends_flattening_by_distances_with_a_map(dome, stage):
 
 
 def test_ctrl_c_during_sampling_returns_the_current_map(dome, monkeypatch):
-    sample = "quasiharmonic.apps.flattening.distances.distance_descent.sample_distances"
+    sample = "quasiharmonic.apps.flattening.distance_descent.sample_distances"
     monkeypatch.setattr(sample, Mock(side_effect=KeyboardInterrupt))
     result = flatten(*dome, energy="distances", rings=6)
     assert result.status is Status.INTERRUPTED

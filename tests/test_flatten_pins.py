@@ -9,7 +9,7 @@ import pytest
 
 from quasiharmonic import Status, certify, flatten
 from quasiharmonic.apps.flattening.piece import Piece
-from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, move_onto_pins, pin_obstructions
+from quasiharmonic.apps.flattening.pin_search import PinSearch, move_onto_pins, pin_obstructions
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.results import Forbids, Kind
 from quasiharmonic.surfaces import annulus, cat, disk, grid, random_delaunay

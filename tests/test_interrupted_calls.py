@@ -166,7 +166,7 @@ def test_at_the_start_of_a_descent_the_map_is_unchanged(function):
 
 
 def test_while_distances_are_sampled(monkeypatch):
-    sample = "quasiharmonic.apps.flattening.distances.distance_descent.sample_distances"
+    sample = "quasiharmonic.apps.flattening.distance_descent.sample_distances"
     monkeypatch.setattr(sample, Mock(side_effect=KeyboardInterrupt))
     V, F = disk(6)
     result = keep_distances(V, F, 1.5 * V)

@@ -36,7 +36,7 @@ from .apps.displacement_fields.nearest import (
 from .apps.displacement_fields.nearest import (
     nearest_invertible as nearest_invertible,
 )
-from .apps.flattening.distances.distance_descent import keep_distances as keep_distances
+from .apps.flattening.distance_descent import keep_distances as keep_distances
 from .apps.flattening.free_boundary import flatten as flatten
 from .apps.flattening.patterns import write_pattern as write_pattern
 from .apps.gradients.derivative import Derivative as Derivative

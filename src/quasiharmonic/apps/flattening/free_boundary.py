@@ -18,6 +18,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.flattening.coarse_distances import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.connected_parts import (
     Part,
     align_with_axis,
@@ -25,8 +26,7 @@ from quasiharmonic.apps.flattening.connected_parts import (
     place_in_row,
     split_parts,
 )
-from quasiharmonic.apps.flattening.distances.distance_descent import lower_distance_error
-from quasiharmonic.apps.flattening.distances.multilevel import lower_coarse_distance_error
+from quasiharmonic.apps.flattening.distance_descent import lower_distance_error
 from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece, check_in_range, to_given_unit
 from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
@@ -203,8 +203,8 @@ def _flatten(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
     kept = joint == np.arange(len(V))
     held, free, results = list[Part](), split_parts(V, F, None if kept.all() else kept), list[MapResult]()
     if checked.fixed is not None:
-        from quasiharmonic.apps.flattening.pins.part_arrangement import flatten_pinned_parts
-        from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, check_pins
+        from quasiharmonic.apps.flattening.part_arrangement import flatten_pinned_parts
+        from quasiharmonic.apps.flattening.pin_search import PinSearch, check_pins
 
         pins = _weld_pins(joint, *check_pins(checked.fixed, checked.target, len(V)))
         if len(free) == 1 and kept.all():

@@ -19,7 +19,7 @@ import numpy as np
 
 from quasiharmonic.apps.flattening.connected_parts import Part, name_part, unite_parts
 from quasiharmonic.apps.flattening.contacts import nearest_on_edges
-from quasiharmonic.apps.flattening.pins.pin_search import PinSearch, pin_obstructions
+from quasiharmonic.apps.flattening.pin_search import PinSearch, pin_obstructions
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.loops import check_loops, winding

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.distances.distance_descent import (
+from quasiharmonic.apps.flattening.distance_descent import (
     choose_sampling,
     lower_errors,
     make_descent,
