@@ -111,8 +111,8 @@ def find_charts(
         working, rest = _keep_parts(V, F, np.flatnonzero(~exact), given, cost, uv)
     min_gain = _MIN_GAIN if uv_cuts is None else np.inf
     coarse = uv_cuts is None and max_charts is None and not given.size
-    make = partial(CoarseSearch, max_stretch, min_gain, workers) if coarse else None
-    cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain, make=make)
+    make_search = partial(CoarseSearch, max_stretch, min_gain, workers) if coarse else None
+    cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain, make_search=make_search)
     draft.charts = [*charts]
     total = surface_area(V, F)
     divisible = None if max_charts is None else max_charts - len(charts)
@@ -251,9 +251,9 @@ def _cut(
     given: IntArray,
     cost: FloatArray,
     min_gain: float,
-    make: Callable[[FloatArray], CoarseSearch] | None,
+    make_search: Callable[[FloatArray], CoarseSearch] | None,
 ) -> list[WorkingChart]:
-    """Cut triangles into disks, or with ``make`` large surfaces into charts.
+    """Cut triangles into disks, or with ``make_search`` large surfaces into charts.
 
     ``given`` cuts are demanded.
     """
@@ -261,15 +261,9 @@ def _cut(
     there = given[are_sides(given, F[rows], n)]
     vertices = np.flatnonzero(mark(n, F[rows]))
     own = invert_indices(n, vertices)[F[rows]]
-    gain = min_gain if len(there) else _MIN_GAIN
-    charts = cut_into_charts(
-        V[vertices],
-        own,
-        np.searchsorted(vertices, there),
-        cost[rows],
-        gain,
-        None if make is None else make(V[vertices]),
-    )
+    points, gain = V[vertices], min_gain if len(there) else _MIN_GAIN
+    coarse = None if make_search is None else make_search(points)
+    charts = cut_into_charts(points, own, np.searchsorted(vertices, there), cost[rows], gain, coarse)
     for chart in charts:
         chart.triangles, chart.vertices = rows[chart.triangles], vertices[chart.vertices]
     return charts
