@@ -71,6 +71,9 @@ def lab(tmp_path):
 def test_a_drag_in_jupyterlab_moves_the_map_of_the_kernel(browser, lab, tmp_path):
     page = browser.new_page(viewport={"width": 1200, "height": 900})
     page.set_default_timeout(60_000)
+    # JupyterLab may ask at any time, such as for a kernel while its server is slow: its own choice will do.
+    dialog = page.locator(".jp-Dialog")
+    page.add_locator_handler(dialog, lambda: dialog.locator("button.jp-mod-accept").first.click())
     page.goto(lab, wait_until="commit")
     page.locator(".jp-Notebook-ExecutionIndicator[data-status=idle]").first.wait_for()
     for _ in range(5):  # a cell that is run before the kernel is ready may be forgotten
