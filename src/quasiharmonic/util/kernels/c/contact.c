@@ -48,10 +48,16 @@ static void read_board(Board *board, const char *cells)
         const char *from = cells + i * board->columns;
         uint64_t *row = row_of(board, 0, i);
         int32_t *before = board->before + i * (board->columns + 1), sum = 0;
-        for (int64_t j = 0; j < board->columns; j++) {
-            before[j] = sum;
-            row[j / 64] |= (uint64_t)(from[j] != 0) << (j % 64);
-            sum += from[j] != 0;
+        for (int64_t first = 0; first < board->columns; first += 64) {
+            const int64_t end = first + 64 < board->columns ? first + 64 : board->columns;
+            uint64_t bits = 0;
+            for (int64_t j = first; j < end; j++) {
+                const int occupied = from[j] != 0;
+                before[j] = sum;
+                bits |= (uint64_t)occupied << (j - first);
+                sum += occupied;
+            }
+            row[first / 64] = bits;
         }
         before[board->columns] = sum;
     }
