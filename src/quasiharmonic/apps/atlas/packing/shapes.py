@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from quasiharmonic.geometry.exact.triangles import triangle_signs
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each, to_complex, to_points
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each, to_complex
+from quasiharmonic.util.kernels import compiled
 
 # A shape is straight if this share of its outline lies along two perpendicular directions, up to this angle.
 _STRAIGHT, _SKEW = 0.4, np.pi / 180
+# Corners of hulls are at least this far from the side between their neighbours, relative to the size of the hull.
+_HULL_ROUNDING = 2.0**-48
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +30,7 @@ class Shape:
     tails, heads : (e,) complex128
         Ends of the directed edges. Each point is as often a tail as it is a head.
     hull : (h,) complex128
-        Corners of the convex hull, or all points if they are on a line.
+        Corners of the convex hull, or its two ends if all points are on a line.
     area : float
         Area of the triangles.
     direction : complex
@@ -95,11 +97,49 @@ def make_shape(uv: FloatArray, F: IntArray) -> Shape:
 
 
 def convex_hull(points: ComplexArray) -> ComplexArray:
-    """Corners of the convex hull; all points if they are on a line."""
-    try:
-        return points[ConvexHull(to_points(points)).vertices]
-    except (QhullError, ValueError):
-        return points
+    """Corners of the convex hull, counterclockwise from the leftmost one; the two ends if all points are on a line.
+
+    Points are not corners if they are so close to the side between two corners that only rounding tells them apart.
+    """
+    points = points[np.lexsort((points.imag, points.real))]
+    close = _HULL_ROUNDING * max(float(np.ptp(points.real)), float(np.ptp(points.imag)))
+    corners = np.empty(len(points) + 1, dtype=np.int64)
+    return points[corners[: find_hull(points, close, corners)]]
+
+
+@compiled
+def find_hull(points: ComplexArray, close: float, corners: IntArray) -> int:
+    """Fill in the indices of `convex_hull`, and return their number (Andrew's monotone chain [1]_).
+
+    Parameters
+    ----------
+    points : (m,) complex128
+        In ascending order of x, and then of y.
+    close : float
+        Distance of a corner from the side between its neighbours.
+    corners : (m + 1,) int64
+        Output.
+
+    References
+    ----------
+    .. [1] A. Andrew, Another efficient algorithm for convex hulls in two dimensions. Information Processing Letters 9
+       (1979).
+    """
+    x, y = points.real.tolist(), points.imag.tolist()
+    count, least = 0, 1
+    # The lower side from left to right, and then the upper one back.
+    for way in (range(len(x)), range(len(x) - 2, -1, -1)):
+        for i in way:
+            while count > least:
+                a, b = corners[count - 2], corners[count - 1]
+                along, up = x[i] - x[a], y[i] - y[a]
+                if along * (y[b] - y[a]) - up * (x[b] - x[a]) < -close * (abs(along) + abs(up)):
+                    break
+                count -= 1
+            corners[count] = i
+            count += 1
+        least = count
+    return max(count - 1, 1)
 
 
 def _find_straight_direction(sides: ComplexArray) -> complex | None:
