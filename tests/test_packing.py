@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull, QhullError
 
 from quasiharmonic import is_injective, surfaces, unwrap
 from quasiharmonic.apps.atlas.packing import bitmap_search
+from quasiharmonic.apps.atlas.packing.shapes import convex_hull
 from quasiharmonic.atlas import pack_charts
 
 shapely = pytest.importorskip("shapely")
@@ -311,3 +313,18 @@ def test_charts_in_later_tiles_keep_apart_without_padding():
     result = unwrap(points.reshape(-1, 3), F.reshape(-1, 3), padding=0, tiles=40, resolution=256, texels_per_unit=80)
     assert result.uvs.max() > 2
     assert result.certificate.bijective
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(3, 60), st.sampled_from([4, 1 << 30]), st.integers(0, 2**32 - 1))
+def test_hulls_have_the_corners_that_qhull_finds(size, steps, seed):
+    rng = np.random.default_rng(seed)
+    points = (rng.integers(0, steps, (size, 2)) / steps) @ [[0.8, 0.6], [-0.6, 0.8]]
+    try:
+        expected = points[ConvexHull(points).vertices]
+    except QhullError:
+        expected = points[[np.lexsort(points.T[::-1])[k] for k in (0, -1)]]
+    hull = convex_hull(points @ [1, 1j])
+    assert set(hull) == set(expected @ [1, 1j])
+    sides = np.roll(hull, -1) - hull
+    assert ((sides.conj() * np.roll(sides, -1)).imag >= 0).all()
