@@ -188,19 +188,21 @@ static int64_t find_place(const Board *board, const Bitmap *bitmap, int64_t leas
             for (int64_t j = 64 * w; bits; bits >>= 1, j++) {
                 if (!(bits & 1))
                     continue;
-                const int up = above[w] >> j % 64 & 1, down = below[w] >> j % 64 & 1;
-                const int to_left = left >> j % 64 & 1, to_right = right >> j % 64 & 1;
-                if ((up + down) * rise + (to_left + to_right) * side <= best)
-                    continue;
+                /* Shifts by one cell that are not free, and the most contact that each has. */
+                const struct {
+                    int64_t row, column, most;
+                } shifts[] = {
+                    {i + 1, j, (above[w] >> j % 64 & 1) ? rise : 0},
+                    {i - 1, j, (below[w] >> j % 64 & 1) ? rise : 0},
+                    {i, j + 1, (right >> j % 64 & 1) ? side : 0},
+                    {i, j - 1, (left >> j % 64 & 1) ? side : 0},
+                };
                 int64_t contact = 0;
-                if (up)
-                    contact += count_overlap(board, bitmap, i + 1, j);
-                if (down)
-                    contact += count_overlap(board, bitmap, i - 1, j);
-                if (to_right)
-                    contact += count_overlap(board, bitmap, i, j + 1);
-                if (to_left)
-                    contact += count_overlap(board, bitmap, i, j - 1);
+                for (int k = 0; k < 4; k++)
+                    contact += shifts[k].most;
+                for (int k = 0; k < 4 && contact > best; k++)
+                    if (shifts[k].most > 0)
+                        contact += count_overlap(board, bitmap, shifts[k].row, shifts[k].column) - shifts[k].most;
                 if (contact > best) {
                     best = contact;
                     place[0] = i;
