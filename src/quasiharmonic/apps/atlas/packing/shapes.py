@@ -13,8 +13,10 @@ from quasiharmonic.util.kernels import compiled
 
 # A shape is straight if this share of its outline lies along two perpendicular directions, up to this angle.
 _STRAIGHT, _SKEW = 0.4, np.pi / 180
-# Corners of hulls are at least this far from the side between their neighbours, relative to the size of the hull.
-_HULL_ROUNDING = 2.0**-48
+# Corners of hulls are found on a grid of 2 to this power of cells along a side.
+_HULL_BITS = 46
+# Corners are at least this far from the side between their neighbours, in cells.
+_LEAST_HEIGHT = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,22 +103,22 @@ def convex_hull(points: ComplexArray) -> ComplexArray:
 
     Points are not corners if they are so close to the side between two corners that only rounding tells them apart.
     """
-    points = points[np.lexsort((points.imag, points.real))]
-    close = _HULL_ROUNDING * max(float(np.ptp(points.real)), float(np.ptp(points.imag)))
+    # Rounded to a fine grid, points on an upright side have the same x.
+    unit = 2.0 ** (np.frexp(max(np.ptp(points.real), np.ptp(points.imag)))[1] - _HULL_BITS)
+    rounded = np.rint((points - complex(points.real.min(), points.imag.min())) / unit)
+    order = np.lexsort((rounded.imag, rounded.real))
     corners = np.empty(len(points) + 1, dtype=np.int64)
-    return points[corners[: find_hull(points, close, corners)]]
+    return points[order[corners[: find_hull(rounded[order], corners)]]]
 
 
 @compiled
-def find_hull(points: ComplexArray, close: float, corners: IntArray) -> int:
+def find_hull(points: ComplexArray, corners: IntArray) -> int:
     """Fill in the indices of `convex_hull`, and return their number (Andrew's monotone chain [1]_).
 
     Parameters
     ----------
     points : (m,) complex128
-        In ascending order of x, and then of y.
-    close : float
-        Distance of a corner from the side between its neighbours.
+        Of whole numbers, in ascending order of x, and then of y.
     corners : (m + 1,) int64
         Output.
 
@@ -126,19 +128,21 @@ def find_hull(points: ComplexArray, close: float, corners: IntArray) -> int:
        (1979).
     """
     x, y = points.real.tolist(), points.imag.tolist()
-    count, least = 0, 1
+    count, kept = 0, 1
     # The lower side from left to right, and then the upper one back.
     for way in (range(len(x)), range(len(x) - 2, -1, -1)):
         for i in way:
-            while count > least:
+            while count > kept:
                 a, b = corners[count - 2], corners[count - 1]
-                along, up = x[i] - x[a], y[i] - y[a]
-                if along * (y[b] - y[a]) - up * (x[b] - x[a]) < -close * (abs(along) + abs(up)):
+                along, up, across, high = x[i] - x[a], y[i] - y[a], x[b] - x[a], y[b] - y[a]
+                turn, least = up * across - along * high, _LEAST_HEIGHT * (abs(along) + abs(up))
+                beyond = along * across + up * high > along * along + up * up
+                if turn > (0 if beyond else least):
                     break
                 count -= 1
             corners[count] = i
             count += 1
-        least = count
+        kept = count
     return max(count - 1, 1)
 
 
