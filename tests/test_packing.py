@@ -328,3 +328,8 @@ def test_hulls_have_the_corners_that_qhull_finds(size, steps, quarters, seed):
     np.testing.assert_allclose(*reach, rtol=0, atol=1e-12)
     if size > 2 and steps > 9:
         assert set(hull) == set(z[ConvexHull(np.stack([z.real, z.imag], axis=1)).vertices])
+
+
+def test_hulls_keep_the_ends_of_sides_that_are_upright_up_to_rounding():
+    z = np.array([1j, 1e-17, 2e-17 + 0.5j, 1 + 0.5j])
+    assert set(convex_hull(z)) == {1j, 1e-17, 1 + 0.5j}
