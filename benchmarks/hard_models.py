@@ -55,8 +55,9 @@ def triangulate(outline: ArrayLike) -> NDArray[np.int64]:
         a, b, c = (P[rest[(k + step) % len(rest)]] for step in (-1, 0, 1))
         turns = [(q[0] - p[0]) * (P[rest, 1] - p[1]) - (q[1] - p[1]) * (P[rest, 0] - p[0]) for p, q in ((a, b), (b, c))]
         turns.append((a[0] - c[0]) * (P[rest, 1] - c[1]) - (a[1] - c[1]) * (P[rest, 0] - c[0]))
-        inside = np.all(np.array(turns) >= 0, axis=0)
         doubled = turns[0][(k + 1) % len(rest)]
+        # A corner on a side would leave a triangle without area, also if rounding places it outside.
+        inside = np.all(np.array(turns) >= -1e-9 * doubled, axis=0)
         longest = max(np.linalg.norm(a - b), np.linalg.norm(b - c), np.linalg.norm(c - a))
         return float(doubled / longest) if doubled > 0 and inside.sum() <= 3 else 0.0
 

@@ -21,24 +21,12 @@ from hard_models import Mesh
 from quasiharmonic import surfaces, unwrap
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from speed import machine
-from unwrapping import PADDING, RESOLUTION, Corners, Unwrap, by_xatlas, cpu_seconds, measure, ours
+from unwrapping import RESOLUTION, Corners, Unwrap, by_uvunwrap, by_xatlas, cpu_seconds, measure, ours
 
 # Largest angles in degrees between triangles in one plane, and between a straight side and an axis.
 _FLAT, _SKEW = 1e-4, 1.0
 _DRAWN = "L bracket with a fillet", "stairs", "house", "plate with holes", "tube with caps", "robot"
 _COLUMNS = "charts", "seams", "used", "stretch, 99 %", "whole", "straight", "CPU s"
-
-
-def by_uvunwrap(V: FloatArray, F: IntArray) -> Corners:
-    """Uvunwrap with its defaults."""
-    import uvunwrap
-
-    mesh = uvunwrap.Mesh(V.astype(np.float32).ravel().tolist(), F.ravel().tolist())
-    atlas = uvunwrap.generate([mesh], page_size=RESOLUTION, padding=PADDING)
-    made = atlas.meshes[0]
-    uv = np.array(made.uv).reshape(-1, 2)
-    uv *= [atlas.width, atlas.height] if uv.max() <= 1 else [1, 1]
-    return uv[np.array(made.indices).reshape(-1, 3)]
 
 
 def shares(V: FloatArray, F: IntArray, corners: Corners) -> tuple[float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import hard_models as models
@@ -171,6 +171,7 @@ def distance_to_right_angles(angle):
 
 @given(st.floats(0, 6.3), st.floats(0.2, 3), st.floats(0.1, 0.6))
 @examples(30)
+@example(0.5, 0.2, 0.328125)  # a corner on a diagonal
 def test_shapes_with_right_angles_are_straight(angle, width, notch):
     outline = [[0, 0], [width, 0], [width, 1], [notch * width, 1], [notch * width, notch], [0, notch]]
     shape = make_shape(rotated(outline, angle), models.triangulate(outline))

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
 
 from quasiharmonic import is_injective, surfaces, unwrap
 from quasiharmonic.apps.atlas.packing import bitmap_search
+from quasiharmonic.apps.atlas.packing.shapes import convex_hull
 from quasiharmonic.atlas import pack_charts
 
 shapely = pytest.importorskip("shapely")
@@ -311,3 +313,23 @@ def test_charts_in_later_tiles_keep_apart_without_padding():
     result = unwrap(points.reshape(-1, 3), F.reshape(-1, 3), padding=0, tiles=40, resolution=256, texels_per_unit=80)
     assert result.uvs.max() > 2
     assert result.certificate.bijective
+
+
+@given(
+    st.integers(1, 40), st.sampled_from([2, 3, 9, 1 << 30]), st.sampled_from([0, 1, 2, 4]), st.integers(0, 2**32 - 1)
+)
+def test_hulls_have_the_corners_that_qhull_finds(size, steps, quarters, seed):
+    """Turned grids have points on lines, and on upright ones, up to rounding."""
+    rng = np.random.default_rng(seed)
+    z = (rng.integers(0, steps, (size, 2)) / steps) @ [1, 1j] * np.exp(0.25j * np.pi * quarters)
+    hull = convex_hull(z)
+    around = np.exp(1j * np.linspace(0, 2 * np.pi, 97))
+    reach = [(points[:, None] * around).real.max(axis=0) for points in (hull, z)]
+    np.testing.assert_allclose(*reach, rtol=0, atol=1e-12)
+    if size > 2 and steps > 9:
+        assert set(hull) == set(z[ConvexHull(np.stack([z.real, z.imag], axis=1)).vertices])
+
+
+def test_hulls_keep_the_ends_of_sides_that_are_upright_up_to_rounding():
+    z = np.array([1j, 1e-17, 2e-17 + 0.5j, 1 + 0.5j])
+    assert set(convex_hull(z)) == {1j, 1e-17, 1 + 0.5j}

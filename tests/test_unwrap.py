@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from quasiharmonic import inverted_triangles, unwrap
@@ -411,6 +411,7 @@ def test_a_model_of_thin_triangles_alone_has_no_measured_stretch(height):
 @pytest.mark.long
 @given(st.integers(3, 8), st.integers(1, 8), st.integers(0, 2**31), st.integers(-16, -7), st.sampled_from([1.0, 1.5]))
 @examples(30)
+@example(4, 5, 604, -8, 1.0)  # two charts that would close
 def test_models_of_thin_triangles_have_a_report_and_no_stretched_charts(n, f, seed, exponent, bound):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(n, 3)) * [1, 10.0**exponent, 10.0**exponent]

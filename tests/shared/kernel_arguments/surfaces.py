@@ -381,6 +381,16 @@ def _(rng):
     return opposite, side, graph.rim, graph.cost, start, int(np.flatnonzero(graph.rim[side])[0]), 9.0, 0 * side
 
 
+def hull_points(rng: np.random.Generator, size: int, steps: int) -> Arguments:
+    """Points of whole numbers in ascending order."""
+    z = np.sort(rng.integers(0, steps, size) + 1j * rng.integers(0, steps, size))
+    return z, np.zeros(size + 1, dtype=np.int64)
+
+
+for size, steps in ((1, 5), (2, 5), (3, 5), (30, 5), (30, 1), (30, 20), (300, 1 << 46)):
+    arguments_of("find_hull")(partial(hull_points, size=size, steps=steps))
+
+
 @arguments_of("find_contact")
 def _(rng, shape=(40, 150), density=0.02, sizes=((9, 30), (30, 9), (2, 3))):
     """Random bitmaps on a random board with a frame; some do not fit."""

@@ -340,7 +340,9 @@ class PaperModel:
             return False
         uv = np.empty((int(own.max()) + 1, 2))
         uv[own] = to_points(self._pieces.place[rows].ravel()).reshape(-1, 3, 2)
-        return not check_loops(boundary_loops(own, len(uv)), np.rint(uv / self._unit) * self._unit)[1]
+        # A closed surface has no boundary, and overlaps itself in the plane.
+        loops = boundary_loops(own, len(uv))
+        return bool(loops) and not check_loops(loops, np.rint(uv / self._unit) * self._unit)[1]
 
     def _closes_demanded(self, rows: IntArray, own: IntArray) -> bool:
         """Whether the two sides of a demanded seam have equal vertices ``own`` (k, 3) at both ends."""

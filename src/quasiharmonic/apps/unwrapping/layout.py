@@ -94,14 +94,17 @@ class LayoutChoice:
 
         If almost all outlines of a list lie along the axes, so must those of the list that is returned.
         """
-        straight = np.array([_straight_share(charts) for charts in found])
-        allowed = straight >= (straight.max() - _BENT if straight.max() >= _MOSTLY_STRAIGHT else 0.0)
-        chosen, use, count = found[-1], -1.0, -1
-        for k in np.flatnonzero(allowed)[::-1].tolist():
-            if len(found[k]) == count:
-                continue
-            count = len(found[k])
-            charts = self.divide(found[k], V, cost)
+        # Of lists with equal numbers of charts, the last one.
+        lists = list({len(charts): charts for charts in found}.values())
+        if len(lists) > 1:
+            straight = np.array([_straight_share(charts) for charts in lists])
+            allowed = straight >= (straight.max() - _BENT if straight.max() >= _MOSTLY_STRAIGHT else 0.0)
+            lists = [lists[k] for k in np.flatnonzero(allowed)[::-1]]
+        if len(lists) == 1:
+            return self.divide(lists[0], V, cost)
+        chosen, use = lists[0], -1.0
+        for some in lists:
+            charts = self.divide(some, V, cost)
             covered = 0.0
             if len(charts) <= MAX_COMPARED:
                 shapes, above = [chart.shape for chart in charts], max(use + self.loss, 0.0)

@@ -57,26 +57,23 @@ def lay_along(V: FloatArray, F: IntArray, one: IntArray, other: IntArray, compon
     roots = np.unique(component, return_index=True)[1]
     tails, heads = np.concatenate([first, np.full(roots.size, f)]), np.concatenate([second, roots])
     forest = csr_array((np.ones(tails.size), (tails.astype(np.int32), heads.astype(np.int32))), shape=(f + 1, f + 1))
-    order, before = breadth_first_order(forest, f, directed=False)
-    depth = np.zeros(f + 1, dtype=np.int64)
-    for k in order[1:].tolist():
-        depth[k] = depth[before[k]] + 1
+    _, before = breadth_first_order(forest, f, directed=False)
     # The sides that join each triangle to the one before it: its own and the other's.
-    own, there = np.zeros((2, f), dtype=np.int64)
     forward = before[second] == first
-    own[second[forward]], there[second[forward]] = other[forward] % 3, one[forward] % 3
-    own[first[~forward]], there[first[~forward]] = one[~forward] % 3, other[~forward] % 3
-    place = z.copy()
-    levels = np.split(np.argsort(depth[:f], kind="stable"), np.cumsum(np.bincount(depth[:f])[1:-1]))
-    for rows in levels[1:]:
-        parent, k, m = before[rows], own[rows], there[rows]
-        start, end = place[parent, (m + 1) % 3], place[parent, m]
-        here = z[rows]
-        tail, head = here[np.arange(rows.size), k], here[np.arange(rows.size), (k + 1) % 3]
-        turn = (end - start) / (head - tail)
-        turn /= np.abs(turn)
-        place[rows] = (here - tail[:, None]) * turn[:, None] + start[:, None]
-    return place
+    rows, parents = np.where(forward, second, first), np.where(forward, first, second)
+    own, there = np.where(forward, other, one) % 3, np.where(forward, one, other) % 3
+    start, end = z[parents, (there + 1) % 3], z[parents, there]
+    tail, head = z[rows, own], z[rows, (own + 1) % 3]
+    # The motion of each triangle into the frame of a triangle before it, at first the next one; ``f`` after the root.
+    turn, shift = np.ones(f + 1, dtype=np.complex128), np.zeros(f + 1, dtype=np.complex128)
+    turn[rows] = (end - start) / (head - tail)
+    turn /= np.abs(turn)
+    shift[rows] = start - tail * turn[rows]
+    above = np.where(before < 0, f, before)
+    while (above != f).any():
+        turn, shift, above = turn[above] * turn, turn[above] * shift + shift[above], above[above]
+    turn /= np.abs(turn)
+    return z * turn[:f, None] + shift[:f, None]
 
 
 def meet(place: ComplexArray, hinges: Hinges, chosen: IntArray) -> BoolArray:

@@ -26,6 +26,7 @@ SHARED = {
     "GOOD": "geometry/prolongation.py",
     "TOWARDS_MIDDLE": "geometry/prolongation.py",
     "INWARDS": "geometry/prolongation.py",
+    "LEAST_HEIGHT": "apps/atlas/packing/shapes.py",
     "SWEEPS": "solver/methods/relocation.py",
     "IN_VAIN": "solver/methods/relocation.py",
     "SHARING": "solver/methods/relocation.py",

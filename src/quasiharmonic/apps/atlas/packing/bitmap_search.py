@@ -129,6 +129,7 @@ class BitmapSearch:
                 self._bitmaps[i] = Bitmaps(directions, [draw(shapes[i], directions[0], 1 / self._cell, radius)])
             else:
                 self._bitmaps[i] = self._draw(shapes[i], turns, radius)
+        self._least_cells = sum(bitmaps.count for bitmaps in self._bitmaps.values())
         # Small shapes lie in their smallest boxes.
         self._lying = np.array([_find_lying(shapes[i]) if rotate else 1 + 0j for i in small.tolist()])
         sides = [shapes[i].extent(direction)[::-1] for i, direction in zip(small, self._lying, strict=True)]
@@ -203,6 +204,8 @@ class BitmapSearch:
         """
         texels = max(self._size) / cells
         columns, rows = (int(side / texels * (1 + 1e-12)) for side in self._size)
+        if self._least_cells > self._tiles * columns * rows:
+            return None
         boards: list[Board] = []
 
         def open_board() -> Board:

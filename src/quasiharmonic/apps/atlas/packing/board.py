@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import Shape
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, enumerate_each
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, enumerate_each
 from quasiharmonic.util.kernels import compiled
 
 # Side, first row and first column.
@@ -187,14 +187,22 @@ class Runs(NamedTuple):
 
 def list_runs(bitmaps: list[BoolArray]) -> Runs:
     """Return bitmaps (h, w), at least one, as runs."""
-    runs = []
-    for bitmap in bitmaps:
-        change = np.diff(bitmap.astype(np.int8), axis=1, prepend=0, append=0)
-        row, first = np.nonzero(change > 0)
-        found = np.stack([row, first, np.nonzero(change < 0)[1]], axis=1)
-        runs.append(found[np.argsort(found[:, 1] - found[:, 2], kind="stable")])
-    starts = np.cumsum([0, *(len(each) for each in runs)])
-    return Runs(np.concatenate(runs), starts, np.array([bitmap.shape for bitmap in bitmaps], dtype=np.int64))
+    sizes = np.array([bitmap.shape for bitmap in bitmaps], dtype=np.int64)
+    # All rows one after another, with a free cell before each row and after the last one.
+    row_ends = np.cumsum(np.repeat(sizes[:, 1] + 1, sizes[:, 0]))
+    cells = np.zeros(row_ends[-1] + 1, dtype=np.int8)
+    begins = np.cumsum((sizes[:, 1] + 1) * sizes[:, 0])
+    for bitmap, (h, w), end in zip(bitmaps, sizes.tolist(), begins.tolist(), strict=True):
+        cells[end - h * (w + 1) : end].reshape(h, w + 1)[:, 1:] = bitmap
+    change = np.diff(cells)
+    first, end = np.flatnonzero(change > 0), np.flatnonzero(change < 0)
+    row = np.searchsorted(row_ends, first, side="right")
+    before = np.append(0, row_ends)[row]
+    bottom = np.append(0, np.cumsum(sizes[:, 0]))
+    number = np.searchsorted(bottom, row, side="right") - 1
+    order = np.lexsort((first - end, number))
+    runs = np.stack([row - bottom[number], first - before, end - before], axis=1)[order]
+    return Runs(runs, np.searchsorted(number, np.arange(len(bitmaps) + 1)), sizes)
 
 
 def find_most_contact(occupied: BoolArray, bitmaps: Runs) -> Spot | None:
@@ -321,8 +329,9 @@ def _mark_near(cells: BoolArray, tails: ComplexArray, heads: ComplexArray, radiu
     i, j, y, x = i[inside], j[inside], y[inside], x[inside]
     padded = np.zeros((h + 4 * k, w + 4 * k), dtype=bool)
     flat, place = padded.ravel(), (i + 2 * k) * padded.shape[1] + j + 2 * k
+    offset = np.arange(-k + 1, k)[:, None]
+    across = (offset + 0.5 - x) ** 2
     for di in range(-k + 1, k):
-        vertical: FloatArray = (di + 0.5 - y) ** 2
-        for dj in range(-k + 1, k):
-            flat[place[vertical + (dj + 0.5 - x) ** 2 <= reach] + di * padded.shape[1] + dj] = True
+        near = (di + 0.5 - y) ** 2 + across <= reach
+        flat[(place + offset + di * padded.shape[1])[near]] = True
     cells |= padded[2 * k : 2 * k + h, 2 * k : 2 * k + w]

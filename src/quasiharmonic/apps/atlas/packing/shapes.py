@@ -6,13 +6,17 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from quasiharmonic.geometry.exact.triangles import triangle_signs
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each, to_complex, to_points
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each, to_complex
+from quasiharmonic.util.kernels import compiled
 
 # A shape is straight if this share of its outline lies along two perpendicular directions, up to this angle.
 _STRAIGHT, _SKEW = 0.4, np.pi / 180
+# Corners of hulls are found on a grid of 2 to this power of cells along a side.
+_HULL_BITS = 46
+# Corners are at least this far from the side between their neighbours, in cells.
+_LEAST_HEIGHT = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +32,7 @@ class Shape:
     tails, heads : (e,) complex128
         Ends of the directed edges. Each point is as often a tail as it is a head.
     hull : (h,) complex128
-        Corners of the convex hull, or all points if they are on a line.
+        Corners of the convex hull, or its two ends if all points are on a line.
     area : float
         Area of the triangles.
     direction : complex
@@ -95,11 +99,51 @@ def make_shape(uv: FloatArray, F: IntArray) -> Shape:
 
 
 def convex_hull(points: ComplexArray) -> ComplexArray:
-    """Corners of the convex hull; all points if they are on a line."""
-    try:
-        return points[ConvexHull(to_points(points)).vertices]
-    except (QhullError, ValueError):
-        return points
+    """Corners of the convex hull, counterclockwise from the leftmost one; the two ends if all points are on a line.
+
+    Points are not corners if they are so close to the side between two corners that only rounding tells them apart.
+    """
+    # Rounded to a fine grid, points on an upright side have the same x.
+    unit = 2.0 ** (np.frexp(max(np.ptp(points.real), np.ptp(points.imag)))[1] - _HULL_BITS)
+    rounded = np.rint((points - complex(points.real.min(), points.imag.min())) / unit)
+    order = np.lexsort((rounded.imag, rounded.real))
+    corners = np.empty(len(points) + 1, dtype=np.int64)
+    return points[order[corners[: find_hull(rounded[order], corners)]]]
+
+
+@compiled
+def find_hull(points: ComplexArray, corners: IntArray) -> int:
+    """Fill in the indices of `convex_hull`, and return their number (Andrew's monotone chain [1]_).
+
+    Parameters
+    ----------
+    points : (m,) complex128
+        Of whole numbers, in ascending order of x, and then of y.
+    corners : (m + 1,) int64
+        Output.
+
+    References
+    ----------
+    .. [1] A. Andrew, Another efficient algorithm for convex hulls in two dimensions. Information Processing Letters 9
+       (1979).
+    """
+    x, y = points.real.tolist(), points.imag.tolist()
+    count, kept = 0, 1
+    # The lower side from left to right, and then the upper one back.
+    for way in (range(len(x)), range(len(x) - 2, -1, -1)):
+        for i in way:
+            while count > kept:
+                a, b = corners[count - 2], corners[count - 1]
+                along, up, across, high = x[i] - x[a], y[i] - y[a], x[b] - x[a], y[b] - y[a]
+                turn, least = up * across - along * high, _LEAST_HEIGHT * (abs(along) + abs(up))
+                beyond = along * across + up * high > along * along + up * up
+                if turn > (0 if beyond else least):
+                    break
+                count -= 1
+            corners[count] = i
+            count += 1
+        kept = count
+    return max(count - 1, 1)
 
 
 def _find_straight_direction(sides: ComplexArray) -> complex | None:

@@ -9,7 +9,7 @@
 typedef struct {
     int64_t rows, columns, words, levels;
     uint64_t *near;
-    /* Number of occupied cells before each cell of a row. */
+    /* Number of occupied cells before each word of a row. */
     int32_t *before;
 } Board;
 
@@ -40,20 +40,44 @@ static uint64_t bits_from(const uint64_t *row, int64_t words, int64_t bit)
     return row[word] >> shift | row[word + 1] << 1 << (63 - shift);
 }
 
-static void read_board(Board *board, const char *cells)
+static int64_t count_bits(uint64_t bits)
+{
+    bits -= bits >> 1 & 0x5555555555555555u;
+    bits = (bits & 0x3333333333333333u) + (bits >> 2 & 0x3333333333333333u);
+    bits = (bits + (bits >> 4)) & 0x0f0f0f0f0f0f0f0fu;
+    return (int64_t)(bits * 0x0101010101010101u >> 56);
+}
+
+/* Which of eight cells are occupied, the first one in the lowest bit. */
+static uint64_t read_eight(const unsigned char *cells)
+{
+    const uint64_t low = 0x7f7f7f7f7f7f7f7fu;
+    uint64_t bytes = 0;
+    for (int k = 0; k < 8; k++)
+        bytes |= (uint64_t)cells[k] << 8 * k;
+    /* The highest bit of each byte that is not zero, moved to the lowest one. */
+    bytes = (bytes | ((bytes & low) + low)) >> 7 & 0x0101010101010101u;
+    /* The product's highest byte collects bit 8 k at its bit k. */
+    return bytes * 0x0102040810204080u >> 56;
+}
+
+static void read_board(Board *board, const unsigned char *cells)
 {
     const int64_t words = board->words;
     memset(board->near, 0, (size_t)(board->levels * board->rows * (words + 1)) * sizeof(*board->near));
     for (int64_t i = 0; i < board->rows; i++) {
-        const char *from = cells + i * board->columns;
+        const unsigned char *from = cells + i * board->columns;
         uint64_t *row = row_of(board, 0, i);
-        int32_t *before = board->before + i * (board->columns + 1), sum = 0;
-        for (int64_t j = 0; j < board->columns; j++) {
-            before[j] = sum;
-            row[j / 64] |= (uint64_t)(from[j] != 0) << (j % 64);
-            sum += from[j] != 0;
+        int32_t *before = board->before + i * (words + 1), sum = 0;
+        int64_t j = 0;
+        for (; j + 8 <= board->columns; j += 8)
+            row[j / 64] |= read_eight(from + j) << j % 64;
+        for (; j < board->columns; j++)
+            row[j / 64] |= (uint64_t)(from[j] != 0) << j % 64;
+        for (int64_t w = 0; w <= words; w++) {
+            before[w] = sum;
+            sum += (int32_t)count_bits(row[w]);
         }
-        before[board->columns] = sum;
     }
     for (int64_t level = 1; level < board->levels; level++)
         for (int64_t i = 0; i < board->rows; i++) {
@@ -75,14 +99,6 @@ static void read_runs(const Board *board, const int64_t *given, int64_t count, R
         const int64_t last = end - ((int64_t)1 << level), words = (level * board->rows + row) * (board->words + 1);
         runs[k] = (Run){row, first, end, {words + first / 64, words + last / 64}, {first % 64, last % 64}};
     }
-}
-
-static int64_t count_bits(uint64_t bits)
-{
-    int64_t count = 0;
-    for (; bits; bits &= bits - 1)
-        count++;
-    return count;
 }
 
 /* The number of a bitmap's cells that have no cell of it above. `cells` has room for all rows of the board. */
@@ -122,14 +138,26 @@ static void find_collisions(const Board *board, const Bitmap *bitmap, int64_t ro
     }
 }
 
+/* The number of occupied cells of a row before a column. */
+static int64_t count_before(const Board *board, int64_t row, int64_t column)
+{
+    const int64_t word = column / 64;
+    const uint64_t bits = row_of(board, 0, row)[word] & (((uint64_t)1 << column % 64) - 1);
+    return board->before[row * (board->words + 1) + word] + count_bits(bits);
+}
+
 /* The number of a bitmap's cells that would be in occupied cells. */
 static int64_t count_overlap(const Board *board, const Bitmap *bitmap, int64_t row, int64_t column)
 {
     int64_t sum = 0;
     for (int64_t k = 0; k < bitmap->count; k++) {
         const Run *run = bitmap->runs + k;
-        const int32_t *before = board->before + (row + run->row) * (board->columns + 1) + column;
-        sum += before[run->end] - before[run->first];
+        const int64_t length = run->end - run->first, here = row + run->row;
+        if (length < 64) {
+            const uint64_t bits = bits_from(row_of(board, 0, here), board->words, column + run->first);
+            sum += count_bits(bits & (((uint64_t)1 << length) - 1));
+        } else
+            sum += count_before(board, here, column + run->end) - count_before(board, here, column + run->first);
     }
     return sum;
 }
@@ -160,19 +188,21 @@ static int64_t find_place(const Board *board, const Bitmap *bitmap, int64_t leas
             for (int64_t j = 64 * w; bits; bits >>= 1, j++) {
                 if (!(bits & 1))
                     continue;
-                const int up = above[w] >> j % 64 & 1, down = below[w] >> j % 64 & 1;
-                const int to_left = left >> j % 64 & 1, to_right = right >> j % 64 & 1;
-                if ((up + down) * rise + (to_left + to_right) * side <= best)
-                    continue;
+                /* Shifts by one cell that are not free, and the most contact that each has. */
+                const struct {
+                    int64_t row, column, most;
+                } shifts[] = {
+                    {i + 1, j, (above[w] >> j % 64 & 1) ? rise : 0},
+                    {i - 1, j, (below[w] >> j % 64 & 1) ? rise : 0},
+                    {i, j + 1, (right >> j % 64 & 1) ? side : 0},
+                    {i, j - 1, (left >> j % 64 & 1) ? side : 0},
+                };
                 int64_t contact = 0;
-                if (up)
-                    contact += count_overlap(board, bitmap, i + 1, j);
-                if (down)
-                    contact += count_overlap(board, bitmap, i - 1, j);
-                if (to_right)
-                    contact += count_overlap(board, bitmap, i, j + 1);
-                if (to_left)
-                    contact += count_overlap(board, bitmap, i, j - 1);
+                for (int k = 0; k < 4; k++)
+                    contact += shifts[k].most;
+                for (int k = 0; k < 4 && contact > best; k++)
+                    if (shifts[k].most > 0)
+                        contact += count_overlap(board, bitmap, shifts[k].row, shifts[k].column) - shifts[k].most;
                 if (contact > best) {
                     best = contact;
                     place[0] = i;
@@ -208,7 +238,7 @@ static PyObject *find_contact(PyObject *module, PyObject *const *given, Py_ssize
     while ((int64_t)1 << board.levels <= columns)
         board.levels++;
     board.near = malloc((size_t)(board.levels * rows * (board.words + 1)) * sizeof(*board.near));
-    board.before = malloc((size_t)(rows * (columns + 1)) * sizeof(*board.before));
+    board.before = malloc((size_t)(rows * (board.words + 1)) * sizeof(*board.before));
     uint64_t *three = malloc((size_t)(3 * (board.words + 1)) * sizeof(*three));
     uint64_t *cells = malloc((size_t)(rows * board.words) * sizeof(*cells));
     Run *runs = malloc((size_t)(a[2].size / 3 + 1) * sizeof(*runs));

@@ -20,6 +20,7 @@
     with(reweighted) \
     with(removal) \
     with(ring) \
+    with(shapes) \
     with(topology) \
     with(triangles) \
     with(vector_adam)
