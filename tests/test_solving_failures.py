@@ -19,7 +19,7 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.solver.methods import LBFGS, Alternating, LocalRepair, Newton, RandomRestarts, Untangling, VectorAdam
 from quasiharmonic.solver.methods.untangling import untangle
 from quasiharmonic.solver.search import stages
-from quasiharmonic.solver.search.stages import CoarseToFine, IfManyInverted, quick_stages, speed
+from quasiharmonic.solver.search.stages import CoarseToFine, IfManyInverted, LastRepair, quick_stages, speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from shared.infeasible_problems import OBSTRUCTED
 from shared.meshes import boundary_of, signed_areas
@@ -209,19 +209,23 @@ class TestNoMap:
         assert result.stages[0].inverted[1] > 0.02 * len(problem.F)
         assert [stage.name for stage in result.stages] == ["vector-adam, tanh, dirichlet"] + many * ["newton, tanh"]
 
-    def test_newton_precedes_repair_on_large_meshes_with_many_inverted_triangles(self):
+    @pytest.mark.parametrize("few", [True, False])
+    def test_slow_repairs_run_only_if_very_few_triangles_are_inverted(self, few, monkeypatch):
+        if few:
+            monkeypatch.setattr(stages, "FEW_INVERTED", 1.0)
+        strategy = [VectorAdam(iterations=1), LastRepair(Newton(iterations=2, resume=True))]
+        result = solve(Problem(*turned_ring(180)), strategy=strategy)
+        assert [stage.name for stage in result.stages] == ["vector-adam, tanh, dirichlet"] + few * ["newton, tanh"]
+
+    def test_the_descent_continues_on_large_meshes_with_many_inverted_triangles(self):
         V, F = disk(45)
         stages = speed(Problem(V, F, boundary_of(F), V[boundary_of(F)]))
-        words = [type(stage).__name__ for stage in stages]
-        assert words[:4] == ["CoarseToFine", "Composite", "IfManyInverted", "LineShift"]
-        assert [type(stage).__name__ for stage in quick_stages(stages)] == [
-            "CoarseToFine",
-            "Composite",
-            "LineShift",
-        ]
+        first = ["CoarseToFine", "Composite", "EarlyRepair", "EarlyRepair", "VectorAdam", "LineShift"]
+        assert [type(stage).__name__ for stage in stages[:6]] == first
+        assert [type(stage).__name__ for stage in quick_stages(stages)] == first
 
     def test_wide_patches_precede_the_whole_of_a_large_mesh(self):
-        for rings, before in (45, "WideRepair"), (27, "WideRepair"), (20, "CoarseToFine"):
+        for rings, before in (27, "WideRepair"), (20, "CoarseToFine"):
             V, F = disk(rings)
             stages = speed(Problem(V, F, boundary_of(F), V[boundary_of(F)]))
             words = [type(stage).__name__ for stage in stages]

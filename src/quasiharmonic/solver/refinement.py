@@ -197,6 +197,9 @@ class AttemptLimits(NamedTuple):
     # Rounds of splitting around inverted triangles, with and without a construction.
     reduced_rounds: int = 1
     rounds: int = 3
+    # With a construction, edges around inverted triangles are split only if that adds no more vertices than the
+    # construction or this number. Thinning may remove most of so few.
+    many_added: int = 1000
     # Of the budget for failed repairs, an attempt may spend the part 1 / `budget_divisor` of what is left.
     budget_divisor: int = 4
     # If the search on the given mesh fails, a construction with at most this many added vertices is returned
@@ -288,7 +291,8 @@ class _Refinement:
                 return first
         if made.injective and made.added <= _LIMITS.max_added_at_once:
             return self._use_construction(made)
-        found = self._split_edges_and_search(first, reduced, _LIMITS.reduced_rounds)
+        most = max(made.added, _LIMITS.many_added) if made.injective else np.inf
+        found = self._split_edges_and_search(first, reduced, _LIMITS.reduced_rounds, most)
         if found is not None and (not made.injective or found.added <= made.added):
             return found
         return self._use_construction(made)
@@ -298,8 +302,13 @@ class _Refinement:
         self._attempts.append(RefinementAttempt(CONSTRUCTED, made.added, made.injective, made.stages[-1].seconds))
         return made
 
-    def _split_edges_and_search(self, first: MapResult, budget: int, rounds: int) -> MapResult | None:
-        """Split the edges that a diagnosis names, then edges at inverted triangles; return the map if one is found."""
+    def _split_edges_and_search(
+        self, first: MapResult, budget: int, rounds: int, most: float = np.inf
+    ) -> MapResult | None:
+        """Split the edges that a diagnosis names, then edges at inverted triangles; return the map if one is found.
+
+        Edges at inverted triangles are not split if that adds more than ``most`` vertices.
+        """
         problem, self._select = self._problem, without_restarts
         straight = split_edges(problem.V, problem.F, self._flat)
         named = refine_problem(refined_problem(problem, straight))
@@ -313,6 +322,8 @@ class _Refinement:
                 return result
             finer = split_edges(refined.V, refined.F, _edges_around_inverted(refined, result.certificate))
             refined = compose(refined, finer)
+            if len(refined.parents) > most:
+                break
             result = self._search_on(AROUND, refined, finer.extend(result.uv), budget)
         return result if result.injective else None
 

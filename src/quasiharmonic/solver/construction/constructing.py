@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,9 @@ class ConstructionTuning(NamedTuple):
     added_per_vertex: int = 50
     # Final maximum of added vertices: walks around many displaced pins can grow without bound.
     max_added: int = 60_000
+    # Thinning takes long with more added vertices than this. Of several constructions with so many vertices, only the
+    # one with the fewest is thinned.
+    many_added: int = 1000
 
 
 _TUNING = ConstructionTuning()
@@ -137,27 +141,50 @@ def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Constructi
     """Yield constructions near the best known map (n, 2) and without a guide, each better than the previous ones.
 
     The target satisfies `is_simple`. At least one construction is yielded; the last one adds the fewest vertices. A
-    certified map is yielded before it is thinned. If every way to cut needs too many vertices, ``best_map`` is yielded
-    with ``cut`` False.
+    certified map is yielded before it is thinned. If all add many vertices, only the one with the fewest is thinned.
+    If every way to cut needs too many vertices, ``best_map`` is yielded with ``cut`` False.
     """
-    best = None
+    best: tuple[bool, int] | None = None
+
+    def is_better(made: Construction) -> bool:
+        nonlocal best
+        if best is not None and _rank(made) > best:
+            return False
+        best = _rank(made)
+        return True
+
+    # Constructions that are not thinned yet, with their ranks.
+    unthinned: list[tuple[tuple[bool, int], Iterator[Construction]]] = []
+    thinned = False
     # Near a bad map walks may grow without end, because each runs along the previous ones.
     first = _TUNING.added_per_vertex * (problem.n + _TUNING.added_per_vertex)
     for guide, limit in ((best_map, first), (None, first), (best_map, max(first, _TUNING.max_added))):
         if best is not None and (limit > first or not best[1]):
             break
+        steps = construct_and_thin(problem, guide, max_added=limit)
         try:
-            for made in construct_and_thin(problem, guide, max_added=limit):
-                rank = not made.certificate.bijective, len(made.refined.parents)
-                if best is None or rank <= best:
-                    best = rank
-                    yield made
+            made = next(steps)
         except TooManyError:
             continue
+        if is_better(made):
+            yield made
+        if len(made.refined.parents) > _TUNING.many_added:
+            unthinned.append((_rank(made), steps))
+            continue
+        thinned = True
+        yield from filter(is_better, steps)
+    if unthinned and not thinned:
+        _, steps = min(unthinned, key=itemgetter(0))
+        yield from filter(is_better, steps)
     if best is None:
         certificate = certify(problem.F, best_map, loops=problem.domain.loops)
         uncut = as_refined(problem.V, problem.F, problem.F, [])
         yield Construction(uncut, best_map, certificate, np.empty(0, dtype=np.int64), cut=False)
+
+
+def _rank(made: Construction) -> tuple[bool, int]:
+    """Sort key of a construction; lower is better."""
+    return not made.certificate.bijective, len(made.refined.parents)
 
 
 def construct_and_thin(
