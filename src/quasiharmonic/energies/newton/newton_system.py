@@ -7,13 +7,14 @@ once. Assembly converts the triangles' quadratic forms to blocks and sums these 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.energies.energies import QuadraticForm
-from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
+from quasiharmonic.linsolve import LinearSolver, NotPositiveDefinite, make_solver
 from quasiharmonic.linsolve.laplacian import stiffness_pattern
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, list_others, repeat_each, work
 from quasiharmonic.util.kernels import compiled
@@ -55,7 +56,12 @@ class NewtonSystem:
         place = invert_indices(n, self.free).astype(np.int32)
         self.take_gradients(g)
         self._pattern(F, place)
-        self.solver = make_solver(self._indptr, self._indices, name=linear_solver)
+        self._linear_solver = linear_solver
+
+    @cached_property
+    def solver(self) -> LinearSolver:
+        """The solver, which is made when it is used first."""
+        return make_solver(self._indptr, self._indices, name=self._linear_solver)
 
     def take_gradients(self, g: ComplexArray) -> None:
         """Set new gradients (3, f) of the hat functions on the same triangles, for example for another scale."""
