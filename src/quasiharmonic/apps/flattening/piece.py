@@ -208,7 +208,7 @@ class Flattening:
         piece, solver = self._piece, self._options.linear_solver
         if len(piece.F) < COARSE_FROM or self._weights is not None or np.ptp(piece.V[:, 2]) == 0:
             return None
-        found = find_almost_isometry(piece.V, piece.F, piece.loops, solver)
+        found = find_almost_isometry(piece.V, self._measure, piece.loops, solver)
         if found is not None:
             energy = self._measure.value(in_units(found.uv, 0))
             self._run.add_stage("start", energy=(energy, energy))
@@ -341,7 +341,7 @@ class Flattening:
     ) -> Status | None:
         """Descend from a map, which must be bijective if ``guarded``; return None if the result overlaps itself."""
         options, solver = self._options, self._options.linear_solver
-        energy = self._piece.energy(self._density if near else ReweightedDirichlet(), self._weights)
+        energy = self._measure if near else self._piece.energy(ReweightedDirichlet(), self._weights)
         rim = self._rim if guarded else None
         descent = SurfaceDescent(energy, uv, solver, rim=rim, iterate=True, rotations=rotations)
         self._solver = descent.linear_solver

@@ -15,12 +15,12 @@ vertex. About five steps suffice from a coarse mesh with a fiftieth of the verti
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 
 from quasiharmonic.apps.flattening.multilevel import COARSEST, RATIO, STEPS, Hierarchy, descend_level, flatten_levels
-from quasiharmonic.apps.flattening.surface_descent import NEAR_ENERGY
 from quasiharmonic.apps.flattening.worst_triangles import thick_energy
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, SymmetricDirichlet
@@ -35,9 +35,11 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, 
 
 # Maximum ratio between the vertex counts of the surface and of the coarse mesh.
 _RATIO = 50.0
-# Rigid steps are tried if the coarse map's mean energy is at most this. Coarse maps of sheets have 0.05 to 0.1, due to
+# Rigid steps are tried if the coarse map's mean energy is at most this. Coarse maps of sheets have 0.05 to 0.3, due to
 # thin coarse triangles.
-_MAX_COARSE_ENERGY = 0.2
+_MAX_COARSE_ENERGY = 0.5
+# Maximum mean energy of their result.
+_MAX_ENERGY = 1.0
 _MAX_STEPS = 10
 # Steps continue as long as they lower the energy to at most this fraction.
 _USEFUL = 0.5
@@ -57,11 +59,31 @@ class AlmostIsometry(NamedTuple):
 
 
 def find_almost_isometry(
-    V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_solver: str
+    V: FloatArray, measure: DeformationEnergy, loops: Sequence[IntArray], linear_solver: str
 ) -> AlmostIsometry | None:
     """Return an almost isometric map of a large surface, or None if a few steps find none.
 
-    ``V`` (n, 3) is of about unit size, and the surface is connected and has no handles.
+    ``V`` (n, 3) is of about unit size. ``measure`` is any energy of the surface, which is connected, without handles
+    and weights.
+    """
+    w = _prolong_coarse_map(V, measure.F, loops, linear_solver)
+    if w is None:
+        return None
+    energy = copy(measure)
+    energy.energy = SymmetricDirichlet()
+    rotations = RotationPath.of(energy.F, energy.g, len(V), np.zeros(1, dtype=np.int64), linear_solver)
+    if rotations is None:
+        return None
+    found = _take_rigid_steps(V, energy, rotations, w)
+    return None if found is None else AlmostIsometry(found, rotations)
+
+
+def _prolong_coarse_map(
+    V: FloatArray, F: IntArray, loops: Sequence[IntArray], linear_solver: str
+) -> ComplexArray | None:
+    """Return the map (n,) of a coarse mesh, prolonged to the surface; None if the coarse map is not almost isometric.
+
+    Triangles may be inverted.
     """
     hierarchy = Hierarchy(V, F, list(loops), COARSEST)
     coarse = hierarchy.coarsest(len(V) / _RATIO)
@@ -76,13 +98,7 @@ def find_almost_isometry(
         return None
     w = np.zeros(len(V), dtype=np.complex128)
     w[level.vertices] = in_units(uv, 0)
-    w = hierarchy.prolong(w, coarse, 0, np.zeros(len(V), dtype=bool), _HEIGHT)
-    energy = DeformationEnergy(V, F, SymmetricDirichlet())
-    rotations = RotationPath.of(F, energy.g, len(V), np.zeros(1, dtype=np.int64), linear_solver)
-    if rotations is None:
-        return None
-    found = _take_rigid_steps(V, energy, rotations, w)
-    return None if found is None else AlmostIsometry(found, rotations)
+    return hierarchy.prolong(w, coarse, 0, np.zeros(len(V), dtype=bool), _HEIGHT)
 
 
 def _take_rigid_steps(
@@ -104,7 +120,7 @@ def _take_rigid_steps(
                 found, least = w, value
             if not useful:
                 break
-    return to_points(found) if found is not None and least < NEAR_ENERGY else None
+    return to_points(found) if found is not None and least < _MAX_ENERGY else None
 
 
 def _rotations(V: FloatArray, F: IntArray, d: Deformation) -> ComplexArray:

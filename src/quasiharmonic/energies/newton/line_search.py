@@ -24,6 +24,7 @@ Laplacian approximates the second derivatives of the energy, so conjugate gradie
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -149,12 +150,16 @@ class RotationPath:
     """
 
     def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
-        self._F, self._corners = F, np.ascontiguousarray(F.T)
+        self._F = F
         self._g = g
         # The cross product of the gradients gives the area up to a common factor.
         self._area: FloatArray = 1 / np.abs((g[1].conj() * g[2]).imag)
         stiffness = 2 * self._area * (g * g[(1, 2, 0), :].conj()).real
         self._laplacian = Laplacian(F, n, fixed, linear_solver).factor(stiffness)
+
+    @cached_property
+    def _corners(self) -> IntArray:
+        return np.ascontiguousarray(self._F.T)
 
     @property
     def linear_solver(self) -> str:
@@ -207,7 +212,7 @@ class RotationPath:
         ``diagonal`` (2 (n - k),) is theirs. The function maps (n - k,) to (n - k,) complex128.
         """
         free = self._laplacian.laplacian.free
-        own = np.bincount(self._corners.ravel(), (2 * self._area * np.abs(self._g) ** 2).ravel())
+        own = np.bincount(self._F.T.ravel(), (2 * self._area * np.abs(self._g) ** 2).ravel())
         scale = np.median(own[free] / diagonal.reshape(-1, 2).mean(axis=1))
 
         def solve(load: ComplexArray) -> ComplexArray:

@@ -79,7 +79,7 @@ class NewtonSystem:
         nth = np.arange(row.size) - np.append(0, np.cumsum(degree))[row]
         self._corner_slots = np.stack([upper[:-1], upper[:-1] + 1, lower])
         xx, yx = upper[row] + 2 + 2 * nth, lower[row] + 1 + 2 * nth
-        self._side_slots = np.stack([xx, xx + 1, yx, yx + 1])
+        self._side_slots = np.stack([xx, xx + 1, yx, yx + 1]).astype(np.int32)
         self._indptr = np.append(np.stack([upper[:-1], lower], axis=1).ravel(), upper[-1]).astype(np.int32)
         self._indices = np.empty(upper[-1], dtype=np.int32)
         own = 2 * np.arange(size)
