@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
-from quasiharmonic.apps.flattening.rigid_steps import AlmostIsometry, find_almost_isometry
+from quasiharmonic.apps.flattening.rigid_steps import ALMOST_FROM, AlmostIsometry, find_almost_isometry
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import PatchDescents, has_collapsed, thin_triangles
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
@@ -206,7 +206,7 @@ class Flattening:
     def _find_almost_isometry(self) -> AlmostIsometry | None:
         """Return an almost isometric map of a large surface, if there is one."""
         piece, solver = self._piece, self._options.linear_solver
-        if len(piece.F) < COARSE_FROM or self._weights is not None or np.ptp(piece.V[:, 2]) == 0:
+        if len(piece.F) < ALMOST_FROM or self._weights is not None or np.ptp(piece.V[:, 2]) == 0:
             return None
         found = find_almost_isometry(piece.V, self._measure, piece.loops, solver)
         if found is not None:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.flattening.multilevel import COARSEST, RATIO, STEPS, Hierarchy, descend_level, flatten_levels
-from quasiharmonic.apps.flattening.worst_triangles import thick_energy
+from quasiharmonic.apps.flattening.worst_triangles import mark_around, thick_energy
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, SymmetricDirichlet
 from quasiharmonic.energies.newton.line_search import RotationPath
@@ -45,8 +45,8 @@ _MAX_STEPS = 10
 _USEFUL = 0.5
 # Triangles with a larger ratio between their singular values do not determine their rotations, their neighbours do.
 _SHEARED = 4.0
-# Number of rings of triangles whose rotations their neighbours determine.
-_RINGS = 3
+#: Number of triangles from which `find_almost_isometry` saves time.
+ALMOST_FROM = 30_000
 # Height of ears, as in `Hierarchy.prolong`.
 _HEIGHT = 0.3
 
@@ -61,7 +61,7 @@ class AlmostIsometry(NamedTuple):
 def find_almost_isometry(
     V: FloatArray, measure: DeformationEnergy, loops: Sequence[IntArray], linear_solver: str
 ) -> AlmostIsometry | None:
-    """Return an almost isometric map of a large surface, or None if a few steps find none.
+    """Return an almost isometric map of a surface, or None if a few steps find none.
 
     ``V`` (n, 3) is of about unit size. ``measure`` is any energy of the surface, which is connected, without handles
     and weights.
@@ -124,24 +124,24 @@ def _take_rigid_steps(
 
 
 def _rotations(V: FloatArray, F: IntArray, d: Deformation) -> ComplexArray:
-    """Rotations (f,) of triangles; sheared and inverted ones follow their neighbours across edges."""
+    """Rotations (f,) of triangles; sheared ones, and some rings around inverted ones, follow their neighbours."""
     p, q = np.abs(d.p), np.abs(d.q)
     turned = np.where(p > 0, d.p / p, 1)
     bad = ~(p + q < _SHEARED * (p - q))
     if not bad.any():
         return turned
+    bad |= has_marked_corner(F, mark_around(F, ~(p > q), len(V)))
     around = np.flatnonzero(has_marked_corner(F, mark(len(V), F[bad])))
     sides = rest_shapes(V, F[around]).sides.T.ravel()
     here, there = find_pairs(F[around])
     here, there = np.concatenate([here, there]), np.concatenate([there, here])
     follows, own = bad[around], turned[around]
-    for _ in range(_RINGS):
-        use = follows[here // 3] & ~follows[there // 3]
+    while (use := follows[here // 3] & ~follows[there // 3]).any():
         # Both triangles map the edge between them to the same vector, in opposite directions.
         vector = -own[there[use] // 3] * sides[there[use]]
         total = sum_at(here[use] // 3, vector * sides[here[use]].conj(), around.size)
-        known = np.abs(total) > 0
-        own[known] = total[known] / np.abs(total[known])
-        follows[known] = False
+        size = np.abs(total)
+        own[size > 0] = total[size > 0] / size[size > 0]
+        follows[here[use] // 3] = False
     turned[around] = own
     return turned
