@@ -57,6 +57,7 @@ class NewtonSystem:
         self.take_gradients(g)
         self._pattern(F, place)
         self._linear_solver = linear_solver
+        heartbeat()
 
     @cached_property
     def solver(self) -> LinearSolver:
