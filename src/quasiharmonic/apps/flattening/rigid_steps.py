@@ -105,7 +105,7 @@ def _take_rigid_steps(
     V: FloatArray, energy: DeformationEnergy, rotations: RotationPath, w: ComplexArray
 ) -> FloatArray | None:
     """Return the best injective map of several rigid steps if it is almost an isometry, or None."""
-    found, least, before, d = None, np.inf, len(energy.F), energy.deform(w)
+    found, least, d = None, np.inf, energy.deform(w)
     for _ in range(_MAX_STEPS):
         with np.errstate(all="ignore"):
             try:
@@ -114,12 +114,7 @@ def _take_rigid_steps(
                 break
             d = energy.deform(w)
             inverted, value = int(np.count_nonzero(~(np.abs(d.p) > np.abs(d.q)))), energy.value_of(d)
-        if inverted:
-            # Inverted triangles that remain are folded on the surface itself.
-            if inverted >= before:
-                break
-            before = inverted
-        elif is_injective(energy.F, to_points(w)):
+        if not inverted and is_injective(energy.F, to_points(w)):
             useful = value <= _USEFUL * least
             if value < least:
                 found, least = w, value
