@@ -13,11 +13,13 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
+from quasiharmonic.apps.flattening.rigid_steps import ALMOST_FROM, AlmostIsometry, find_almost_isometry
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import PatchDescents, has_collapsed, thin_triangles
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
+from quasiharmonic.energies.newton.line_search import RotationPath
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify, is_injective
@@ -183,11 +185,14 @@ class Flattening:
 
     def _descend(self, start: FloatArray | None) -> Status:
         """Descend with a free boundary; if the result overlaps itself, descend again with a guarded boundary."""
+        almost = self._find_almost_isometry() if start is None else None
+        start = almost.uv if almost is not None else start
         if start is not None:
             start = self._fit_scale(start)
             if not self._rim.meets_itself(start):
                 self._bijective = start
-            status = self._run_descent(start, guarded=False, near=False)
+            near = almost is not None
+            status = self._run_descent(start, guarded=False, near=near, rotations=almost and almost.rotations)
             if status is not None:
                 return status
         if self._bijective is None:
@@ -197,6 +202,17 @@ class Flattening:
             if status is not None:
                 return status
         return self._descend_guarded()
+
+    def _find_almost_isometry(self) -> AlmostIsometry | None:
+        """Return an almost isometric map of a large surface, if there is one."""
+        piece, solver = self._piece, self._options.linear_solver
+        if len(piece.F) < ALMOST_FROM or self._weights is not None or np.ptp(piece.V[:, 2]) == 0:
+            return None
+        found = find_almost_isometry(piece.V, self._measure, piece.loops, solver)
+        if found is not None:
+            energy = self._measure.value(in_units(found.uv, 0))
+            self._run.add_stage("start", energy=(energy, energy))
+        return found
 
     def _descend_guarded(self) -> Status:
         """Descend from the current bijective map with a guarded boundary."""
@@ -320,11 +336,14 @@ class Flattening:
         scaled = centred * factor
         return scaled if is_injective(self._piece.F, scaled) else np.ldexp(unit, round(np.log2(factor)))
 
-    def _run_descent(self, uv: FloatArray, *, guarded: bool, near: bool) -> Status | None:
+    def _run_descent(
+        self, uv: FloatArray, *, guarded: bool, near: bool, rotations: RotationPath | None = None
+    ) -> Status | None:
         """Descend from a map, which must be bijective if ``guarded``; return None if the result overlaps itself."""
         options, solver = self._options, self._options.linear_solver
-        energy = self._piece.energy(self._density if near else ReweightedDirichlet(), self._weights)
-        descent = SurfaceDescent(energy, uv, solver, rim=self._rim if guarded else None, iterate=True)
+        energy = self._measure if near else self._piece.energy(ReweightedDirichlet(), self._weights)
+        rim = self._rim if guarded else None
+        descent = SurfaceDescent(energy, uv, solver, rim=rim, iterate=True, rotations=rotations)
         self._solver = descent.linear_solver
         apart, status = guarded, Status.STILL_FALLING
         recent: deque[tuple[float, FloatArray]] = deque(maxlen=_RECENT)

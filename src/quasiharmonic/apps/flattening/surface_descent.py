@@ -291,7 +291,7 @@ class SurfaceDescent(IteratedDescent):
 
     ``fixed`` has at least one vertex, to prevent drift; usually exactly one. With the surface's boundary as ``rim`` the
     map stays bijective. ``pairs`` are further second derivatives of the energy. Without rim and pairs,
-    ``iterate`` is that of `IteratedDescent`.
+    ``iterate`` is that of `IteratedDescent`. ``rotations`` are those of the surface, if the map is almost an isometry.
     """
 
     model: SurfaceModel
@@ -306,10 +306,17 @@ class SurfaceDescent(IteratedDescent):
         rim: Rim | None = None,
         pairs: Pairs | None = None,
         iterate: bool = False,
+        rotations: RotationPath | None = None,
     ) -> None:
         options = uv, linear_solver, np.asarray(fixed, dtype=np.int64), pairs
         model = SurfaceModel(energy, *options) if rim is None else GuardedModel(energy, *options, rim)
-        super().__init__(model, model.start(uv), iterate=iterate and rim is None and pairs is None)
+        self._rotations = rotations
+        super().__init__(
+            model,
+            model.start(uv),
+            iterate=iterate and rim is None and pairs is None,
+            inverse_near=None if rotations is None else rotations.inverse_near,
+        )
 
     @property
     def uv(self) -> FloatArray:
@@ -324,7 +331,7 @@ class SurfaceDescent(IteratedDescent):
     @property
     def linear_solver(self) -> str:
         """Name of the linear solver."""
-        return self.model.system.solver.name
+        return self.model.system.solver.name if self._rotations is None else self._rotations.linear_solver
 
     def move_to(self, uv: FloatArray) -> None:
         """Continue from another map (n, 2) without contacts."""

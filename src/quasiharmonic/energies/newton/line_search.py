@@ -14,15 +14,23 @@ is tangent to the straight line and rotates the triangle without strain. Triangl
 together. The map whose derivatives are closest to these, weighted by rest area, is the solution of a linear system with
 a constant Laplacian. At first order the triangles fit, so the path is tangent to the direction. A step along it has the
 same expected decrease as Newton's step.
+
+The same system has two more uses near an isometry. The map whose derivatives are closest to the rotations of all
+triangles has less strain (`RotationPath.turn`), without the limits that thin triangles set to a straight step. And the
+Laplacian approximates the second derivatives of the energy, so conjugate gradients with it converge in few iterations
+(`RotationPath.inverse_near`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from quasiharmonic.energies.deformation import pulls
+from quasiharmonic.energies.energies import Deformation
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, sum_at
@@ -142,12 +150,21 @@ class RotationPath:
     """
 
     def __init__(self, F: IntArray, g: ComplexArray, n: int, fixed: IntArray, linear_solver: str = "auto") -> None:
-        self._F, self._corners = F, np.ascontiguousarray(F.T)
+        self._F = F
         self._g = g
         # The cross product of the gradients gives the area up to a common factor.
         self._area: FloatArray = 1 / np.abs((g[1].conj() * g[2]).imag)
         stiffness = 2 * self._area * (g * g[(1, 2, 0), :].conj()).real
         self._laplacian = Laplacian(F, n, fixed, linear_solver).factor(stiffness)
+
+    @cached_property
+    def _corners(self) -> IntArray:
+        return np.ascontiguousarray(self._F.T)
+
+    @property
+    def linear_solver(self) -> str:
+        """Name of the linear solver."""
+        return self._laplacian.laplacian.solver.name
 
     @classmethod
     def of(
@@ -177,6 +194,33 @@ class RotationPath:
             return w + t * direction + self._laplacian.respond(sum_at(self._corners.ravel(), load.ravel(), w.size))
 
         return at
+
+    def turn(self, w: ComplexArray, d: Deformation, rotations: ComplexArray) -> ComplexArray:
+        """Return the map (n,) closest to given rotations (f,) of the rest triangles' frames, as unit complex numbers.
+
+        The fixed vertices stay as in the map ``w`` (n,), whose deformation is ``d``. Triangles may be inverted. With
+        the rotations of ``w``, this is a step of Sorkine and Alexa's method (2007) for `ARAP`. May raise
+        `NotPositiveDefinite` as `path`.
+        """
+        load = np.empty(w.size, dtype=np.complex128)
+        pulls(rotations - d.p, -d.q, self._area, self._F, self._g, load)
+        return w + self._laplacian.respond(load)
+
+    def inverse_near(self, diagonal: FloatArray) -> Callable[[ComplexArray], ComplexArray]:
+        """Return an approximate inverse of an energy's second derivatives near an isometry, for `NewtonSystem.iterate`.
+
+        ``diagonal`` (2 (n - k),) is theirs. The function maps (n - k,) to (n - k,) complex128.
+        """
+        free = self._laplacian.laplacian.free
+        own = np.bincount(self._F.T.ravel(), (2 * self._area * np.abs(self._g) ** 2).ravel())
+        scale = np.median(own[free] / diagonal.reshape(-1, 2).mean(axis=1))
+
+        def solve(load: ComplexArray) -> ComplexArray:
+            full = np.zeros(own.size, dtype=np.complex128)
+            full[free] = scale * load
+            return self._laplacian.respond(full)[free]
+
+        return solve
 
     def _derivatives(self, w: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """``∂w/∂z`` and ``∂w/∂z̄`` on every triangle, (f,) complex128 each."""

@@ -16,20 +16,22 @@ their absolute values, which allows longer steps. Afterwards they are clamped to
 In an `IteratedDescent`, conjugate gradients replace some factorisations. Far from the minimum, the error of a map that
 was prolonged from a coarse mesh is mostly local. A few iterations without a factor remove it, in a tenth of the time of
 a factorisation. Close to the minimum the second derivatives hardly change, so a few iterations with the last factor
-suffice for the last steps.
+suffice for the last steps. Close to an isometry, iterations with a Laplacian replace all factorisations. It has one
+unknown per vertex and not two, so its factor takes an eighth of the time and a quarter of the memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
+from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem.result import Status
-from quasiharmonic.util.arrays import ComplexArray, work
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, work
 
 # Relative increases of the diagonal, tried in turn until a factorisation exists. Rounding alone changes the eigenvalues
 # by about the first. They can be this small where triangle sizes span many orders of magnitude.
@@ -57,6 +59,8 @@ class IterationTuning(NamedTuple):
     # Maximum number of iterations with the factor of an earlier step, and of iterations without a factor.
     max_reused: int = 8
     max_smoothing: int = 30
+    # Maximum number of iterations with a Laplacian. If they do not suffice, the descent factors from then on.
+    max_near: int = 20
     # Iterations without a factor continue as long as they lower the energy to at most this fraction.
     smoothed: float = 0.5
     # Factors of earlier steps serve if the decrease of the last step differs by at most this fraction from the expected
@@ -69,6 +73,10 @@ class IterationTuning(NamedTuple):
 
 
 _ITERATION = IterationTuning()
+
+
+#: See `RotationPath.inverse_near`.
+InverseNear = Callable[[FloatArray], Callable[[ComplexArray], ComplexArray]]
 
 
 class NewtonState(NamedTuple):
@@ -257,11 +265,15 @@ class NewtonDescent:
 class IteratedDescent(NewtonDescent):
     """A `NewtonDescent` that replaces factorisations for large surfaces, if ``iterate``.
 
-    The model's system must depend on the state by its values alone.
+    The model's system must depend on the state by its values alone. ``inverse_near`` is a `RotationPath.inverse_near`
+    if the map is close to an isometry.
     """
 
-    def __init__(self, model: NewtonModel, state: NewtonState, *, iterate: bool) -> None:
+    def __init__(
+        self, model: NewtonModel, state: NewtonState, *, iterate: bool, inverse_near: InverseNear | None = None
+    ) -> None:
         super().__init__(model, state)
+        self._inverse_near = inverse_near
         self._iterates = iterate and state.w.size >= _ITERATION.min_vertices
         self._smoothed, self._negligible = np.inf, 0.0
         # The objective that the last step with a factor should have led to, and the decrease that it expected.
@@ -276,6 +288,11 @@ class IteratedDescent(NewtonDescent):
         self, gradient: ComplexArray, negative: float, shifts: tuple[float, ...] = SHIFTS
     ) -> tuple[ComplexArray, float, bool]:
         """See `NewtonDescent`; a direction without a factor does not count as Newton's."""
+        if self._inverse_near is not None and negative <= 0:
+            direction = self._iterate_near(gradient, negative, self._inverse_near)
+            if direction is not None:
+                return direction, -work(gradient, direction), True
+            self._inverse_near = None
         model, value = self.model, self.state.value
         iterates = self._iterates and value < _ITERATION.max_energy
         if iterates and value <= _ITERATION.smoothed * self._smoothed:
@@ -301,6 +318,22 @@ class IteratedDescent(NewtonDescent):
         else:
             self._goal = -np.inf
         return direction, expected_decrease, newton
+
+    def _iterate_near(self, gradient: ComplexArray, negative: float, inverse_near: InverseNear) -> ComplexArray | None:
+        """Return Newton's direction near an isometry; None if the iterations do not converge."""
+        system = self.model.system
+        self.model.assemble(self.state, negative)
+        try:
+            direction, converged = system.iterate(
+                -gradient,
+                inverse_near(system.diagonal),
+                _ITERATION.max_near,
+                residual=_ITERATION.residual,
+                negligible=self._negligible,
+            )
+        except NotPositiveDefinite:
+            return None
+        return direction if converged else None
 
     def _expect(self, expected_decrease: float) -> None:
         """Record the decrease that a full step should have."""

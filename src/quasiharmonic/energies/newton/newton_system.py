@@ -7,13 +7,14 @@ once. Assembly converts the triangles' quadratic forms to blocks and sums these 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.energies.energies import QuadraticForm
-from quasiharmonic.linsolve import NotPositiveDefinite, make_solver
+from quasiharmonic.linsolve import LinearSolver, NotPositiveDefinite, make_solver
 from quasiharmonic.linsolve.laplacian import stiffness_pattern
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, list_others, repeat_each, work
 from quasiharmonic.util.kernels import compiled
@@ -55,7 +56,13 @@ class NewtonSystem:
         place = invert_indices(n, self.free).astype(np.int32)
         self.take_gradients(g)
         self._pattern(F, place)
-        self.solver = make_solver(self._indptr, self._indices, name=linear_solver)
+        self._linear_solver = linear_solver
+        heartbeat()
+
+    @cached_property
+    def solver(self) -> LinearSolver:
+        """The solver, which is made when it is used first."""
+        return make_solver(self._indptr, self._indices, name=self._linear_solver)
 
     def take_gradients(self, g: ComplexArray) -> None:
         """Set new gradients (3, f) of the hat functions on the same triangles, for example for another scale."""
@@ -73,7 +80,7 @@ class NewtonSystem:
         nth = np.arange(row.size) - np.append(0, np.cumsum(degree))[row]
         self._corner_slots = np.stack([upper[:-1], upper[:-1] + 1, lower])
         xx, yx = upper[row] + 2 + 2 * nth, lower[row] + 1 + 2 * nth
-        self._side_slots = np.stack([xx, xx + 1, yx, yx + 1])
+        self._side_slots = np.stack([xx, xx + 1, yx, yx + 1]).astype(np.int32)
         self._indptr = np.append(np.stack([upper[:-1], lower], axis=1).ravel(), upper[-1]).astype(np.int32)
         self._indices = np.empty(upper[-1], dtype=np.int32)
         own = 2 * np.arange(size)
