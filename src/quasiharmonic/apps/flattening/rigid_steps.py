@@ -3,7 +3,8 @@
 A coarse mesh determines how far each part of a sheet turns, but not the shape of thin triangles, which shorten the
 steps of Newton's method. A *rigid step* rotates each rest triangle as the map does, and returns the map closest to the
 rotated triangles. Neither thin nor inverted triangles shorten it, and all steps share one factor with one unknown per
-vertex. About five steps suffice from a coarse mesh with a fiftieth of the vertices.
+vertex. About five steps suffice from a coarse mesh with a fiftieth of the vertices. Vertices of the last inverted
+triangles are relocated.
 
 ::
 
@@ -31,6 +32,7 @@ from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.solver.methods.relocation import relocate
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, sum_at, to_points
 
 # Maximum ratio between the vertex counts of the surface and of the coarse mesh.
@@ -43,6 +45,8 @@ _MAX_ENERGY = 1.0
 _MAX_STEPS = 10
 # Steps continue as long as they lower the energy to at most this fraction.
 _USEFUL = 0.5
+# Up to this number of inverted triangles, their vertices inside the surface are moved to make them positive.
+_FEW_INVERTED = 100
 # Triangles with a larger ratio between their singular values do not determine their rotations, their neighbours do.
 _SHEARED = 4.0
 #: Number of triangles from which `find_almost_isometry` saves time.
@@ -74,7 +78,7 @@ def find_almost_isometry(
     rotations = RotationPath.of(energy.F, energy.g, len(V), np.zeros(1, dtype=np.int64), linear_solver)
     if rotations is None:
         return None
-    found = _take_rigid_steps(V, energy, rotations, w)
+    found = _take_rigid_steps(V, energy, rotations, w, np.concatenate(loops))
     return None if found is None else AlmostIsometry(found, rotations)
 
 
@@ -102,9 +106,12 @@ def _prolong_coarse_map(
 
 
 def _take_rigid_steps(
-    V: FloatArray, energy: DeformationEnergy, rotations: RotationPath, w: ComplexArray
+    V: FloatArray, energy: DeformationEnergy, rotations: RotationPath, w: ComplexArray, rim: IntArray
 ) -> FloatArray | None:
-    """Return the best injective map of several rigid steps if it is almost an isometry, or None."""
+    """Return the best injective map of several rigid steps if it is almost an isometry, or None.
+
+    ``rim`` (k,) are the boundary vertices.
+    """
     found, least, d = None, np.inf, energy.deform(w)
     for _ in range(_MAX_STEPS):
         with np.errstate(all="ignore"):
@@ -113,7 +120,10 @@ def _take_rigid_steps(
             except NotPositiveDefinite:
                 break
             d = energy.deform(w)
-            inverted, value = int(np.count_nonzero(~(np.abs(d.p) > np.abs(d.q)))), energy.value_of(d)
+            inverted = int(np.count_nonzero(~(np.abs(d.p) > np.abs(d.q))))
+            if 0 < inverted <= _FEW_INVERTED and (moved := relocate(energy.F, w, rim)) is not None:
+                w, d, inverted = moved, energy.deform(moved), 0
+            value = energy.value_of(d)
         if not inverted and is_injective(energy.F, to_points(w)):
             useful = value <= _USEFUL * least
             if value < least:
