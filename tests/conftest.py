@@ -135,6 +135,21 @@ def dome():
 
 
 @pytest.fixture
+def factored(monkeypatch):
+    """Numbers of unknown positions in the factored Newton systems."""
+    from quasiharmonic.energies.newton.newton_system import NewtonSystem
+
+    sizes, factor = [], NewtonSystem.factor
+
+    def count(system, shift=0.0):
+        sizes.append(system.free.size)
+        factor(system, shift)
+
+    monkeypatch.setattr(NewtonSystem, "factor", count)
+    return sizes
+
+
+@pytest.fixture
 def example(tmp_path, monkeypatch):
     """Run the ``main`` of one script in a new folder, which draws at half the resolution; return its numbers."""
     import importlib

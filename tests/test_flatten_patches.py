@@ -25,19 +25,6 @@ def nearly_coincident(seed):
     return V, F
 
 
-@pytest.fixture
-def factored(monkeypatch):
-    """Sizes of the factored systems, in vertices."""
-    sizes, factor = [], NewtonSystem.factor
-
-    def count(system, shift=0.0):
-        sizes.append(system.free.size)
-        factor(system, shift)
-
-    monkeypatch.setattr(NewtonSystem, "factor", count)
-    return sizes
-
-
 def test_nearly_coincident_vertices_take_few_steps():
     result = flatten(*nearly_coincident(2))
     # Without patches, 48 steps.

@@ -39,19 +39,6 @@ def energy_and_rotations(V, F):
     return energy, RotationPath(F, energy.g, len(V), FIXED)
 
 
-@pytest.fixture
-def factored(monkeypatch):
-    """Numbers of unknown positions in the factored Newton systems."""
-    sizes, factor = [], NewtonSystem.factor
-
-    def count(system, shift=0.0):
-        sizes.append(system.free.size)
-        factor(system, shift)
-
-    monkeypatch.setattr(NewtonSystem, "factor", count)
-    return sizes
-
-
 def test_turning_triangles_as_an_isometry_gives_the_isometry():
     V, F = grid(9, 7)
     w = np.exp(0.7j) * (V @ [1, 1j])
