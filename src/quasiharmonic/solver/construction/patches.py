@@ -23,8 +23,8 @@ from quasiharmonic.solver.construction.thinning import as_refined
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
 
-class PatchTuning(NamedTuple):
-    """Numbers that tune the patches."""
+class PatchLimits(NamedTuple):
+    """Limits of the patches."""
 
     # Minimum and maximum number of rings of triangles around an inverted one.
     min_rings: int = 2
@@ -34,7 +34,7 @@ class PatchTuning(NamedTuple):
     max_share: float = 0.6
 
 
-_TUNING = PatchTuning()
+_LIMITS = PatchLimits()
 
 
 class _Patch(NamedTuple):
@@ -53,7 +53,7 @@ def construct_patches(problem: Problem, uv: FloatArray) -> Construction | None:
     """
     F, n = problem.F, problem.n
     inverted = inverted_triangles(F, uv)
-    if not 0 < inverted.size <= _TUNING.max_inverted * len(F):
+    if not 0 < inverted.size <= _LIMITS.max_inverted * len(F):
         return None
     patches = _find_patches(problem, uv, inverted)
     if patches is None:
@@ -81,11 +81,11 @@ def _find_patches(problem: Problem, uv: FloatArray, inverted: IntArray) -> list[
     """Return patches around the inverted triangles as rows, vertices and problems; None if they are too large."""
     F, n = problem.F, problem.n
     inside = mark(n, F[inverted])
-    for _ in range(_TUNING.min_rings):
+    for _ in range(_LIMITS.min_rings):
         inside |= _add_ring(F, inside)
-    for _ in range(_TUNING.min_rings, _TUNING.max_rings):
+    for _ in range(_LIMITS.min_rings, _LIMITS.max_rings):
         rows = np.flatnonzero(inside[F].all(axis=1))
-        if rows.size > _TUNING.max_share * len(F):
+        if rows.size > _LIMITS.max_share * len(F):
             return None
         T = F[rows]
         label = label_components(T[:, :2], T[:, 1:], n)[T[:, 0]]
