@@ -37,7 +37,7 @@ class PatchLimits(NamedTuple):
 _LIMITS = PatchLimits()
 
 
-class _Patch(NamedTuple):
+class _PatchProblem(NamedTuple):
     """Triangles (p,) of a mesh, the mesh's index of each of their vertices (v,), and the problem that they make."""
 
     rows: IntArray
@@ -77,7 +77,7 @@ def construct_patches(problem: Problem, uv: FloatArray) -> Construction | None:
     return Construction(refined, uv, certificate, np.empty(0, dtype=np.int64)) if certificate.bijective else None
 
 
-def _find_patches(problem: Problem, uv: FloatArray, inverted: IntArray) -> list[_Patch] | None:
+def _find_patches(problem: Problem, uv: FloatArray, inverted: IntArray) -> list[_PatchProblem] | None:
     """Return patches around the inverted triangles as rows, vertices and problems; None if they are too large."""
     F, n = problem.F, problem.n
     inside = mark(n, F[inverted])
@@ -90,7 +90,7 @@ def _find_patches(problem: Problem, uv: FloatArray, inverted: IntArray) -> list[
         T = F[rows]
         label = label_components(T[:, :2], T[:, 1:], n)[T[:, 0]]
         order = np.argsort(label, kind="stable")
-        found: list[_Patch] = []
+        found: list[_PatchProblem] = []
         poor = np.zeros(n, dtype=bool)
         for some in np.split(rows[order], np.flatnonzero(np.diff(label[order])) + 1):
             vertices, corners = np.unique(F[some], return_inverse=True)
@@ -98,7 +98,7 @@ def _find_patches(problem: Problem, uv: FloatArray, inverted: IntArray) -> list[
             if patch is None:
                 poor[vertices] = True
             else:
-                found.append(_Patch(some, vertices, patch))
+                found.append(_PatchProblem(some, vertices, patch))
         if not poor.any():
             return found
         inside |= _add_ring(F, poor)
