@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 
-from quasiharmonic import Problem, boundary_loops
+from quasiharmonic import Problem, boundary_loops, certify
+from quasiharmonic.geometry.mesh.topology import edges
 from quasiharmonic.surfaces import annulus, disk
 from shared.polygons import random_polygon, spiral, spread
 
@@ -102,3 +105,33 @@ def turned_ring(quarters):
     outer, inner = sorted(boundary_loops(F, len(V)), key=len, reverse=True)
     turn = np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), quarters)
     return Problem(V, F, np.concatenate([outer, inner]), np.concatenate([V[outer], V[inner] @ turn]))
+
+
+def check_construction(problem, made):
+    """Check that the map is certified and that its mesh refines the problem's mesh without splitting fixed edges."""
+    refined, n = made.refined, problem.n
+    assert made.certificate.bijective
+    # Certify from arrays, which finds the loops independently of the construction.
+    assert certify(refined.F, made.uv).bijective
+    assert np.array_equal(made.uv[problem.fixed], problem.target)
+    assert np.array_equal(refined.V[:n], problem.V)
+    assert len(refined.V) == n + len(refined.parents) == len(made.uv)
+    assert sorted(map(tuple, edges(refined.F, len(refined.V)).boundary.tolist())) == sorted(
+        map(tuple, edges(problem.F, n).boundary.tolist())
+    )
+    assert np.array_equal(np.unique(refined.parent), np.arange(len(problem.F)))
+    assert np.allclose(refined.weights.sum(axis=1), 1)
+    # The parts of a triangle lie in it, have its orientation, and cover it, by exact arithmetic in its own coordinates.
+    covered = [Fraction(0)] * len(problem.F)
+    where = [{v: Fraction(1)} for v in range(n)]
+    for between, weights in zip(refined.parents.tolist(), refined.weights.tolist(), strict=True):
+        where.append({v: Fraction(w) for v, w in zip(between, weights, strict=True) if w})
+    assert len(where) == len(refined.V)
+    for corners, parent in zip(refined.F.tolist(), refined.parent.tolist(), strict=True):
+        a, b, c = problem.F[parent].tolist()
+        assert all(where[v].keys() <= {a, b, c} for v in corners)
+        (px, py), (qx, qy), (rx, ry) = ((where[v].get(b, 0), where[v].get(c, 0)) for v in corners)
+        twice = (qx - px) * (ry - py) - (qy - py) * (rx - px)
+        assert twice > 0
+        covered[parent] += twice
+    assert covered == [1] * len(problem.F)

@@ -23,7 +23,7 @@ import numpy as np
 from quasiharmonic.linsolve.base import LinearSolver, NotPositiveDefinite
 from quasiharmonic.linsolve.packages import Qdldl, SuperLU
 from quasiharmonic.util.arrays import FloatArray
-from quasiharmonic.util.threads import count_cores, read_limit
+from quasiharmonic.util.threads import count_cores, make_executor, read_limit
 
 # Minimum fill. By default rslab tries several orders. Its nested dissection takes five times as long to analyse
 # (300,000 unknowns: 3.3 s against 0.3 to 0.6 s), and its factor is less than twice as fast. rslab accepts no given
@@ -31,9 +31,11 @@ from quasiharmonic.util.threads import count_cores, read_limit
 _ORDERING = "amf"
 #: Number of unknowns below which threads do not help.
 SEQUENTIAL_BELOW = 30_000
-# Variables that limit the threads of other libraries also limit rslab's factorisation, which accepts a number of
-# threads. Its solves take a tenth of the time and obey only RAYON_NUM_THREADS (rslab 1.7).
+# Variables that limit the threads of other libraries also limit rslab's.
 _LIMITS = "OMP_NUM_THREADS", "RAYON_NUM_THREADS"
+# Work from which rslab would divide one solve among threads. It does so less well than one thread for each column, and
+# obeys only RAYON_NUM_THREADS (rslab 1.7).
+_NEVER = 2**62
 # Part of rslab's message for a zero pivot; the exception has no class of its own.
 _SINGULAR = "rank-deficient"
 
@@ -74,7 +76,9 @@ class Rslab(LinearSolver):
         pattern = csc_matrix((np.ones(self.nnz), self._indices, self._indptr), shape=(self.n, self.n))
         threads = 1 if self.n < SEQUENTIAL_BELOW else _threads()
         return self._try(
-            lambda: library().analyze(pattern, path="ldlt", ordering=_ORDERING, nemin=nemin, threads=threads)
+            lambda: library().analyze(
+                pattern, path="ldlt", ordering=_ORDERING, nemin=nemin, threads=threads, solve_par_min_work=_NEVER
+            )
         )
 
     def _analyse_late(self) -> bool:
@@ -93,14 +97,19 @@ class Rslab(LinearSolver):
 
     def _solve(self, b: FloatArray) -> FloatArray:
         if self._numeric is not None:
-            x = self._try(
-                lambda: self._numeric.solve_many(b) if b.shape[1] > 1 else self._numeric.solve(b[:, 0])[:, None]
-            )
+            x = self._try(lambda: self._solve_columns(b))
             if x is not None:
                 return np.asfortranarray(x)
             self._factor_by_fallback()
         assert self._fallback is not None
         return np.asfortranarray(self._fallback.solve(b))
+
+    def _solve_columns(self, b: FloatArray) -> Any:
+        """Solve with rslab's factor, for large systems with a thread for each column."""
+        if b.shape[1] > 1 and self.n < SEQUENTIAL_BELOW:
+            return self._numeric.solve_many(b)
+        with make_executor(min(b.shape[1], _threads()), "quasiharmonic: solves") as threads:
+            return np.stack([*threads.map(self._numeric.solve, b.T)], axis=1)
 
     def _check_residual(self, b: FloatArray, x: FloatArray) -> FloatArray:
         try:

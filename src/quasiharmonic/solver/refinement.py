@@ -7,7 +7,8 @@ in several attempts::
                       ──▶ as given ──▶ named edges ──▶ around inverted triangles ──▶ constructed
 
 An attempt is made only if those before it found no map. The construction takes little time, and a failing search
-takes long. The construction is therefore made as soon as the first stages of the search fail, if the target is simple.
+takes long. The construction is therefore made as soon as the first stages of the search fail, if the target is simple;
+only around the inverted triangles, if these are few.
 The number of vertices that it adds determines whether the attempts in between are worth their time. If they are, they
 get a reduced budget. The construction is used if they fail or add more vertices.
 
@@ -18,7 +19,7 @@ they run on the given mesh only.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Stage, Status
 from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.construction.constructing import Construction, constructions, is_simple, refined_problem
+from quasiharmonic.solver.construction.patches import construct_patches
 from quasiharmonic.solver.construction.thinning import thin_refinement
 from quasiharmonic.solver.search.record import RepairBudget
 from quasiharmonic.solver.search.search import allowed_repairs, search_map
@@ -202,6 +204,8 @@ class AttemptLimits(NamedTuple):
     many_added: int = 1000
     # Of the budget for failed repairs, an attempt may spend the part 1 / `budget_divisor` of what is left.
     budget_divisor: int = 4
+    # Up to this number of triangles, a construction of the whole map follows one in patches.
+    small: int = 2000
     # If the search on the given mesh fails, a construction with at most this many added vertices is returned
     # immediately.
     max_added_at_once: int = 1
@@ -356,13 +360,26 @@ class _Refinement:
     def _construct(self, first: MapResult) -> MapResult:
         """Return a constructed map, certified, or a map that shows where double precision is insufficient."""
         began, before, result = time.perf_counter(), self._last, first
-        for made in constructions(self._problem, first.uv):
+        for made in self._constructions(first.uv):
             # Replace the previous construction, which is kept if an interrupt stops the improvement.
             self._last = before
             result = self._append(self._as_result(made, first, time.perf_counter() - began))
         # Include the time of constructions tried after the best one.
         *others, last = result.stages
         return replace(result, stages=[*others, replace(last, seconds=time.perf_counter() - began)])
+
+    def _constructions(self, uv: FloatArray) -> Iterator[Construction]:
+        """Yield constructions near a map (n, 2), each better than the previous ones; one in patches is tried first."""
+        patched = construct_patches(self._problem, uv)
+        if patched is None:
+            yield from constructions(self._problem, uv)
+            return
+        yield patched
+        added = len(patched.refined.parents)
+        if added and len(self._problem.F) <= _LIMITS.small:
+            for made in constructions(self._problem, uv):
+                if made.certificate.bijective and len(made.refined.parents) < added:
+                    yield made
 
     def _as_result(self, made: Construction, first: MapResult, seconds: float) -> MapResult:
         bad = made.certificate.inverted.size + made.certificate.degenerate.size

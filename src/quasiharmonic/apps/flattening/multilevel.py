@@ -217,15 +217,19 @@ class Hierarchy:
 def _fit_affine(flat: ComplexArray, around: ComplexArray) -> ComplexArray:
     """Images of the rings' centres under the affine maps that fit flat rings best to given ones; (r,) complex128."""
     weight = 1 / (flat.real**2 + flat.imag**2 + 1e-12)
-    columns = np.stack([np.ones(flat.shape, dtype=np.complex128), flat, flat.conj()], axis=2)
-    weighted = columns.conj() * weight[:, :, None]
-    normal = np.swapaxes(weighted, 1, 2) @ columns
-    scale = weight.sum(axis=1)
-    normal[:, 2, 2] += _RIGID * scale
-    normal[:, (0, 1), (0, 1)] += 1e-12 * scale[:, None]
+    scale, weighted = weight.sum(axis=1), weight * flat
     middle = around.mean(axis=1)
-    load = np.einsum("rdk,rd->rk", weighted, around - middle[:, None])
-    return middle + np.linalg.solve(normal, load[:, :, None])[:, 0, 0]
+    arm = around - middle[:, None]
+    # The normal equations of arm ≈ c + a·flat + b·conj(flat), from which a and b are eliminated.
+    first, second = weighted.sum(axis=1), (weighted * flat).sum(axis=1)
+    size = (weighted * flat.conj()).real.sum(axis=1)
+    of_a, of_b = size + 1e-12 * scale, size + _RIGID * scale
+    determinant = of_a * of_b - np.abs(second) ** 2
+    a = (first * of_b - first.conj() * second) / determinant
+    b = (first.conj() * of_a - first * second.conj()) / determinant
+    load = (weight * arm).sum(axis=1) - a * (weighted.conj() * arm).sum(axis=1) - b * (weighted * arm).sum(axis=1)
+    place: ComplexArray = middle + load / ((1 + 1e-12) * scale - (a * first.conj() + b * first).real)
+    return place
 
 
 def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, rim: bool) -> BoolArray:

@@ -283,8 +283,8 @@ class RestShapes:
 
 def area_vectors(V: FloatArray, F: NDArray[np.integer]) -> FloatArray:
     """Return a normal (f, 3) of each triangle F (f, 3) between points V (n, 3); its length is twice the area."""
-    corners = V[F]
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    a, b, c = (V[corner] for corner in F.T)
+    return np.cross(b - a, c - a)
 
 
 def surface_area(V: FloatArray, F: NDArray[np.integer]) -> float:
