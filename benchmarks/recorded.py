@@ -38,10 +38,6 @@ LABELS = {
 PROVENANCE = "Intel Xeon, 2 cores, 2026-11-22, quasiharmonic 0.1.0 at eb0ed78"
 #: Less than a tick of the recording clock; ratios use this value for it.
 TICK = 0.004
-#: The letters of the paper's Figure 10.
-LETTERS = "GSRAPH"
-#: Maximum number of triangles of the gallery's surfaces at size 24; at size 64 they have more.
-SMALL = 5000
 #: Families of the recorded evaluation, and the limits of its bands of size.
 EVALUATED = (
     *("noise", "jam", "flow", "swirl", "adrift", "pins", "spiral", "comb", "maze", "limbs", "carved"),
@@ -222,50 +218,6 @@ def repeat(path: Path = RECORDS / "anew.csv") -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         file.write(f"{machine()}\n")
         csv.writer(file, lineterminator="\n").writerows([Run._fields, *runs])
-
-
-class LetterRun(NamedTuple):
-    """L-BFGS alone on one surface and one letter, as stored in `letters_alone.csv`."""
-
-    surface: str
-    letter: str
-    triangles: int
-    column: str
-    iterations: int
-    flips: int
-    mips: str
-    cpu_seconds: float
-
-
-def read_letters_alone(path: Path = RECORDS / "letters_alone.csv") -> list[LetterRun]:
-    """Return the runs of L-BFGS alone."""
-    with path.open(newline="", encoding="utf-8") as file:
-        return [
-            LetterRun(surface, letter, int(triangles), column, int(iterations), int(flips), mips, float(seconds))
-            for surface, letter, triangles, column, iterations, flips, mips, seconds in [*csv.reader(file)][1:]
-        ]
-
-
-def summarise_letters(runs: Iterable[LetterRun]) -> dict[str, dict[str, int | float]]:
-    """Return for each column the problems solved, their total, the maximum iterations and the CPU seconds."""
-    found: dict[str, dict[str, int | float]] = {}
-    for run in runs:
-        column = found.setdefault(run.column, {"of": 0, "solved": 0, "most iterations": 0, "CPU seconds": 0})
-        column["of"] += 1
-        column["CPU seconds"] = round(column["CPU seconds"] + run.cpu_seconds, 1)
-        if run.flips == 0:
-            column["solved"] += 1
-            column["most iterations"] = max(column["most iterations"], run.iterations)
-    return found
-
-
-def letters_by_kind(runs: Sequence[LetterRun]) -> dict[str, dict[str, dict[str, int | float]]]:
-    """Return the summary separately for small and large gallery surfaces and for scans."""
-    groups: dict[str, list[LetterRun]] = {"gallery": [], "gallery, small": [], "scans": []}
-    for run in runs:
-        scan = run.surface.startswith("scan of ")
-        groups["scans" if scan else "gallery" if run.triangles > SMALL else "gallery, small"].append(run)
-    return {name: summarise_letters(group) for name, group in groups.items()}
 
 
 def read_evaluation() -> list[Row]:

@@ -169,7 +169,13 @@ def test_figure_10(example):
     assert numbers["drawn"]["most iterations"] < 100
     # Those among the paper's three functionals that do not do so without help.
     recorded = numbers["recorded"]["gallery, small"]
+    assert {row["of"] for row in numbers["recorded"]["gallery"].values()} == {30}
     assert recorded["V₁ si-log"]["solved"] < recorded["V₃ si-log"]["solved"] <= recorded["V₃ si-log"]["of"] == 30
+
+
+def test_the_runs_of_figure_10_are_recorded_once(example):
+    runs = importlib.import_module("figure_10").read_letters_alone()
+    assert len({(run.surface, run.triangles, run.letter, run.column) for run in runs}) == len(runs)
 
 
 def test_figure_22(example):

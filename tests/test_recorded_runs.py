@@ -88,9 +88,3 @@ def test_the_evaluation_is_reproduced():
     assert str(result.history[0].inverted) == row["start_flipped"]
     mips = distortion(case.V, case.F, result.uv).statistics("mips").mean
     assert mips == pytest.approx(float(row["paper_mips"]), rel=1e-3)
-
-
-def test_the_runs_of_lbfgs_alone_are_complete():
-    runs = recorded.read_letters_alone()
-    assert len({(run.surface, run.triangles, run.letter, run.column) for run in runs}) == len(runs)
-    assert {row["of"] for row in recorded.letters_by_kind(runs)["gallery"].values()} == {30}
