@@ -8,7 +8,7 @@ import pytest
 import hostile_models
 from hostile_models import blocks, find_fault, split_edges
 from quasiharmonic import unwrap
-from quasiharmonic.apps.unwrapping.chart_fitting import mend_charts
+from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, mend_charts
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import close_slits
 from quasiharmonic.apps.unwrapping.charts import Chart, find_charts
@@ -205,6 +205,21 @@ def test_a_chart_that_is_hardly_too_small_is_divided():
     mended = mend_charts([chart], layout, np.array([0]), scale=scale, V=V, cost=np.ones(F.shape), bound=1.5)
     assert len(mended) > 1
     assert sum(len(one.F) for one in mended) == len(F)
+
+
+@pytest.mark.parametrize(("gap", "divided"), [(1e-3, False), (1e-9, True)])
+def test_a_chart_whose_ends_almost_touch_is_divided_before_it_is_packed(gap, divided):
+    V, F = grid(80, 4)
+    angle, radius = (2 * np.pi - gap) * V[:, 0] / V[:, 0].max(), 1 + V[:, 1] / V[:, 1].max()
+    V = np.stack([-radius * np.cos(angle), radius * np.sin(angle), np.zeros(len(V))], axis=1)
+    chart = single_chart(V, F)
+    assert certify(F, chart.uv).bijective
+    parts = divide_fragile([chart], V, np.ones(F.shape), bound=1.5)
+    assert (len(parts) > 1) == divided
+    assert all_bijective(parts, 0.2)
+    assert sum(len(part.F) for part in parts) == len(F)
+    if not divided:
+        assert parts == [chart]
 
 
 @pytest.mark.slow

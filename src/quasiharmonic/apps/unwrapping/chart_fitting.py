@@ -16,7 +16,7 @@ from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, divide_overlap, is_undivided
 from quasiharmonic.apps.unwrapping.chart_maps import WORST_STRETCH
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
-from quasiharmonic.apps.unwrapping.layout import ChartLayout, grid_unit
+from quasiharmonic.apps.unwrapping.layout import GRID_UNIT, ChartLayout, grid_unit
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.mesh.topology import find_pairs, label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
@@ -27,6 +27,8 @@ from quasiharmonic.util.progress import heartbeat
 _HEIGHT, _LEAST_HEIGHT = 8.0, 3.0
 # Charts are not enlarged by less than this factor: another fault than low triangles would remain.
 _LEAST_FACTOR = 1.1
+# Rounding this many times as coarsely as in a texture shows which charts it will probably damage.
+_COARSER = 16.0
 # Charts are enlarged to at most this number of units, which is 2⁻⁷ of the side of a texture.
 _LARGEST = 2.0**17
 
@@ -175,6 +177,27 @@ def _is_fixed(chart: Chart, for_packing: bool) -> bool:
 def _length(chart: Chart) -> float:
     """Longer side of a chart's box."""
     return max(chart.shape.extent(chart.shape.direction))
+
+
+def divide_fragile(charts: Sequence[Chart], V: FloatArray, cost: FloatArray, *, bound: float) -> list[Chart]:
+    """Divide charts that will probably not be bijective in a texture, before they are packed.
+
+    Their positions are rounded `_COARSER` times as coarsely as there. The arguments and the result are those of
+    `mend_charts`.
+    """
+    area = sum(chart.shape.area for chart in charts)
+    unit = _COARSER * float(np.sqrt(area / _TUNING.expected_use)) * GRID_UNIT
+    done: list[Chart] = []
+    waiting = list(charts)
+    while waiting:
+        heartbeat()
+        chart = waiting.pop()
+        verdict = certify(chart.F, np.rint(chart.uv / unit))
+        if verdict.bijective or len(chart.F) == 1:
+            done.append(chart)
+        else:
+            waiting += _divide_faulty(chart, verdict, np.zeros(len(chart.F), dtype=bool), V, cost, bound)
+    return sorted(done, key=lambda chart: int(chart.triangles[0]))
 
 
 def mend_charts(

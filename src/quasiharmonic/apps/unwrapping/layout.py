@@ -25,9 +25,9 @@ _BENT = 0.03
 MAX_COMPARED = 150
 # A layout that uses this share of the texture is good enough: no further list is compared.
 _GOOD_USE = 0.83
-# Positions in the unit square are multiples of this unit. Single precision stores these numbers and their differences
-# from 1 exactly.
-_GRID_UNIT = 2.0**-24
+#: Positions in the unit square are multiples of this unit. Single precision stores these numbers and their differences
+#: from 1 exactly.
+GRID_UNIT = 2.0**-24
 # A vertex moves by at most this number of units along each axis at a time.
 _REACH = 2
 # Maximum number of passes over the triangles that are not positive.
@@ -193,7 +193,7 @@ def round_positions(F: IntArray, uv: FloatArray) -> FloatArray:
 def grid_unit(uv: FloatArray) -> float:
     """Return the unit of which `round_positions` makes positions (n, 2) multiples."""
     # Numbers beyond 1 need a larger unit.
-    return _GRID_UNIT * 2.0 ** int(np.ceil(np.log2(np.abs(uv).max(initial=1.0))))
+    return GRID_UNIT * 2.0 ** int(np.ceil(np.log2(np.abs(uv).max(initial=1.0))))
 
 
 def _repair(F: IntArray, grid: IntArray, wrong: IntArray) -> bool:

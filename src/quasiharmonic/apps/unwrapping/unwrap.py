@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY
 from quasiharmonic.apps.atlas.packing.pack import check_texture
 from quasiharmonic.apps.unwrapping.chart import Chart, pair_charts
-from quasiharmonic.apps.unwrapping.chart_fitting import divide_long_charts, mend_charts
+from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, divide_long_charts, mend_charts
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
@@ -55,8 +55,8 @@ _MAX_EXPONENT = 300
 _RESERVED = 2.0
 # Then so many charts are packed by their shapes, and further ones as boxes.
 _PACKED_CLOSELY = MANY
-# Seconds in which a chart is packed. At most this share of the limit is reserved for that.
-_SECONDS_PER_CHART, _MOST_RESERVED = 4e-4, 0.5
+# Seconds in which a chart is packed, by its shape and as a box. At most this share of the limit is reserved for that.
+_SECONDS_BY_SHAPE, _SECONDS_AS_BOX, _MOST_RESERVED = 1.5e-2, 4e-4, 0.5
 
 
 class UnwrapKeywords(TypedDict, total=False):
@@ -279,13 +279,14 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     if wanted.time_limit is not None:
         spent = time.perf_counter() - began
         count = expect_charts(points, cleaned.F, rules.cost, rules.uv_cuts, bound)
-        packing_time = min(_SECONDS_PER_CHART * count, _MOST_RESERVED * wanted.time_limit)
-        reserved = _RESERVED * spent + packing_time
+        packing_time = _SECONDS_BY_SHAPE * min(count, _PACKED_CLOSELY) + _SECONDS_AS_BOX * count
+        reserved = _RESERVED * spent + min(packing_time, _MOST_RESERVED * wanted.time_limit)
         left = wanted.time_limit - reserved - (time.perf_counter() - began)
     made = run_until(left, lambda: _make_charts(points, cleaned, rules, wanted, size, given, draft, report))
     ended = made is None
     if made is None:
         charts, grown = draft.complete(points, cleaned.F, rules.cost, rules.uv_cuts, bound)
+        charts = divide_fragile(charts, points, rules.cost, bound=bound)
     else:
         charts, strips = made
     while True:
