@@ -18,8 +18,7 @@ from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.solver.methods import LBFGS, Alternating, LocalRepair, Newton, RandomRestarts, Untangling, VectorAdam
 from quasiharmonic.solver.methods.untangling import untangle
-from quasiharmonic.solver.search import stages
-from quasiharmonic.solver.search.stages import CoarseToFine, IfManyInverted, LastRepair, quick_stages, speed
+from quasiharmonic.solver.search.stages import CoarseToFine, OnlyIf, quick_stages, speed
 from quasiharmonic.surfaces import disk, grid, random_delaunay
 from shared.infeasible_problems import OBSTRUCTED
 from shared.meshes import boundary_of, signed_areas
@@ -199,23 +198,16 @@ class TestNoMap:
         result = injective_map(*turned_ring(180), strategy=[Untangling(iterations=2)])
         assert result.status is Status.OUT_OF_ITERATIONS
 
-    @pytest.mark.parametrize("many", [True, False])
-    def test_a_stage_for_many_inverted_triangles_is_skipped_if_few_are_inverted(self, many, monkeypatch):
+    @pytest.mark.parametrize(
+        ("limits", "runs"), [({}, 1), ({"above": 0.02}, 1), ({"above": 1}, 0), ({"up_to": 0.002}, 0), ({"up_to": 1}, 1)]
+    )
+    def test_a_stage_runs_only_if_the_fraction_of_inverted_triangles_is_in_its_range(self, limits, runs):
         problem = Problem(*turned_ring(180))
-        if not many:
-            monkeypatch.setattr(stages, "MANY_INVERTED", 1.0)
-        strategy = [VectorAdam(iterations=1), IfManyInverted(Newton(iterations=2, resume=True))]
-        result = solve(problem, strategy=strategy)
+        result = solve(
+            problem, strategy=[VectorAdam(iterations=1), OnlyIf(Newton(iterations=2, resume=True), **limits)]
+        )
         assert result.stages[0].inverted[1] > 0.02 * len(problem.F)
-        assert [stage.name for stage in result.stages] == ["vector-adam, tanh, dirichlet"] + many * ["newton, tanh"]
-
-    @pytest.mark.parametrize("few", [True, False])
-    def test_slow_repairs_run_only_if_very_few_triangles_are_inverted(self, few, monkeypatch):
-        if few:
-            monkeypatch.setattr(stages, "FEW_INVERTED", 1.0)
-        strategy = [VectorAdam(iterations=1), LastRepair(Newton(iterations=2, resume=True))]
-        result = solve(Problem(*turned_ring(180)), strategy=strategy)
-        assert [stage.name for stage in result.stages] == ["vector-adam, tanh, dirichlet"] + few * ["newton, tanh"]
+        assert [stage.name for stage in result.stages] == ["vector-adam, tanh, dirichlet"] + runs * ["newton, tanh"]
 
     def test_the_descent_continues_on_large_meshes_with_many_inverted_triangles(self):
         V, F = disk(45)

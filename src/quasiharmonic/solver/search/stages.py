@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import takewhile
+from math import inf
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 from quasiharmonic.problem import Problem
@@ -31,16 +32,9 @@ from quasiharmonic.util.hints import suggest
 #: Stages of a strategy.
 Stages: TypeAlias = Sequence[SearchStage]
 
-# Fraction of inverted triangles above which a stage `IfManyInverted` runs.
-MANY_INVERTED = 0.02
-# Fraction of inverted triangles up to which a stage `LastRepair` runs.
-FEW_INVERTED = 0.002
-# Fraction of inverted triangles above which a stage `IfCompositeFailed` runs.
-_HARDLY_UNTANGLED = 0.1
-
 
 class StageThresholds(NamedTuple):
-    """Sizes of problems from which stages run."""
+    """Sizes of problems from which stages run, and fractions of inverted triangles."""
 
     # Number of vertices from which a coarse-to-fine start pays. Making, solving and refining the coarse mesh is then
     # faster than ten iterations on the fine mesh.
@@ -53,6 +47,12 @@ class StageThresholds(NamedTuple):
     composite: int = 1000
     # The same number per boundary edge.
     composite_per_edge: int = 4
+    # Fraction of inverted triangles up to which early repairs run; above it, Newton's method precedes line shifts.
+    many_inverted: float = 0.02
+    # Fraction of inverted triangles up to which the last repairs of a large mesh run.
+    few_inverted: float = 0.002
+    # Above this fraction, the map is no better than without the composite.
+    hardly_untangled: float = 0.1
 
 
 _THRESHOLDS = StageThresholds()
@@ -103,42 +103,26 @@ class TentativeStage(_DescentStage):
             search.lowest_energy = lowest_energy
 
 
-class IfManyInverted(_DescentStage):
-    """Stage that runs only if so many triangles are inverted that line shifts would be slower."""
+@dataclass(frozen=True)
+class OnlyIf(_DescentStage):
+    """Stage that runs only if the fraction of inverted triangles is ``above`` one limit and at most ``up_to`` another.
+
+    With few inverted triangles, line shifts are faster than other descents. With many, repairs are slow or hopeless.
+    """
+
+    above: float = -inf
+    up_to: float = inf
 
     def run(self, search: StageRunner) -> None:
         """See `SearchStage`."""
-        if search.best[0] > MANY_INVERTED * len(search.problem.F):
+        if self.above < search.best[0] / len(search.problem.F) <= self.up_to:
             search.attempt(self.descent)
 
 
-class EarlyRepair(_DescentStage):
-    """Repair before a descent that it may make needless; skipped in the case of `IfManyInverted`."""
+class EarlyRepair(OnlyIf):
+    """Repair before a descent that it may make needless."""
 
     quick: ClassVar[bool] = True
-
-    def run(self, search: StageRunner) -> None:
-        """See `SearchStage`."""
-        if search.best[0] <= MANY_INVERTED * len(search.problem.F):
-            search.attempt(self.descent)
-
-
-class LastRepair(_DescentStage):
-    """Repair that is slow on a large mesh, and hopeless unless very few triangles are inverted."""
-
-    def run(self, search: StageRunner) -> None:
-        """See `SearchStage`."""
-        if search.best[0] <= FEW_INVERTED * len(search.problem.F):
-            search.attempt(self.descent)
-
-
-class IfCompositeFailed(_DescentStage):
-    """Stage that runs only if so many triangles are inverted that the map is no better than without the composite."""
-
-    def run(self, search: StageRunner) -> None:
-        """See `SearchStage`."""
-        if search.best[0] > _HARDLY_UNTANGLED * len(search.problem.F):
-            search.attempt(self.descent)
 
 
 def speed(problem: Problem) -> Stages:
@@ -189,7 +173,7 @@ def _speed(pinned: bool, is_disk: bool, composed: bool, large: bool, wide: bool)
     first_stages: Stages = (first, shift, coarse)
     if large:
         # Newton steps untangle thousands of triangles at once, line shifts only a few.
-        first_stages = (coarse, first, *((IfManyInverted(newton),) if is_disk else ()), shift)
+        first_stages = (coarse, first, *((OnlyIf(newton, above=_THRESHOLDS.many_inverted),) if is_disk else ()), shift)
     return (
         *first_stages,
         *((WideRepair(resume=True),) if wide else ()),
@@ -216,30 +200,31 @@ def _speed_by_composite(large: bool, brief: bool) -> Stages:
     # Close to the composite a fold moves little in an iteration: a longer memory adds up many short steps.
     steps = (0, 0.1), (100, 0.1), (200, 0.02)
     again = VectorAdam(iterations=200, momenta=(0.9, 0.9), schedule=steps, relocation=True, resume=True)
+    many, few = _THRESHOLDS.many_inverted, _THRESHOLDS.few_inverted
     first_stages: Stages = (first, shift, coarse, wide)
     if large:
-        first_stages = (coarse, first, EarlyRepair(shift), EarlyRepair(wide))
+        first_stages = (coarse, first, EarlyRepair(shift, up_to=many), EarlyRepair(wide, up_to=many))
     elif brief:
-        first_stages = (first, EarlyRepair(shift), coarse, EarlyRepair(wide))
+        first_stages = (first, EarlyRepair(shift, up_to=many), coarse, EarlyRepair(wide, up_to=many))
     if brief:
         middle: Stages = (
-            LastRepair(Newton(iterations=60, resume=True)),
-            LastRepair(LineShift(max_failures=20, resume=True)),
-            LastRepair(wide),
-            IfCompositeFailed(Untangling(iterations=400, resume=True)),
+            OnlyIf(Newton(iterations=60, resume=True), up_to=few),
+            OnlyIf(LineShift(max_failures=20, resume=True), up_to=few),
+            OnlyIf(wide, up_to=few),
+            OnlyIf(Untangling(iterations=400, resume=True), above=_THRESHOLDS.hardly_untangled),
         )
         last: Stages = (
-            LastRepair(Untangling(iterations=100, resume=True)),
-            LastRepair(LineShift(max_failures=10, resume=True)),
-            LastRepair(RandomRestarts(max_failures=10, resume=True)),
+            OnlyIf(Untangling(iterations=100, resume=True), up_to=few),
+            OnlyIf(LineShift(max_failures=10, resume=True), up_to=few),
+            OnlyIf(RandomRestarts(max_failures=10, resume=True), up_to=few),
         )
     else:
         middle = Untangling(iterations=400, resume=True), LineShift(max_failures=10, resume=True)
         last = (
-            LastRepair(Newton(iterations=300, resume=True)),
-            LastRepair(Untangling(iterations=200, resume=True)),
-            LastRepair(LineShift(max_failures=10, resume=True)),
-            LastRepair(RandomRestarts(max_failures=30, resume=True)),
+            OnlyIf(Newton(iterations=300, resume=True), up_to=few),
+            OnlyIf(Untangling(iterations=200, resume=True), up_to=few),
+            OnlyIf(LineShift(max_failures=10, resume=True), up_to=few),
+            OnlyIf(RandomRestarts(max_failures=30, resume=True), up_to=few),
         )
     return (*first_stages, again, shift, wide, *middle, second, shift, *last)
 
@@ -305,7 +290,7 @@ def quick_stages(stages: Stages) -> Stages:
 
     before = list(takewhile(lambda stage: stage.coarse, stages))
     first = stages[len(before) : len(before) + 1]
-    rest = [stage for stage in stages[len(before) + 1 :] if not isinstance(stage, IfManyInverted)]
+    rest = [stage for stage in stages[len(before) + 1 :] if not (isinstance(stage, OnlyIf) and stage.above > 0)]
     return [*before, *first, *takewhile(is_quick, rest)]
 
 
