@@ -15,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
-from quasiharmonic.geometry.mesh.splitting import Shares
+from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.solver.construction.constructing import Construction, constructions, is_simple
-from quasiharmonic.solver.construction.thinning import as_refined
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
 
@@ -51,36 +50,45 @@ def construct_patches(problem: Problem, uv: FloatArray) -> Construction | None:
     Return None if too many triangles are inverted, if there are no suitable patches, or if a construction is not
     certified.
     """
-    F, n = problem.F, problem.n
-    inverted = inverted_triangles(F, uv)
-    if not 0 < inverted.size <= _LIMITS.max_inverted * len(F):
+    inverted = inverted_triangles(problem.F, uv)
+    if not 0 < inverted.size <= _LIMITS.max_inverted * len(problem.F):
         return None
     patches = _find_patches(problem, uv, inverted)
     if patches is None:
         return None
-    uv, moved, triangles, shares = uv.copy(), [], [], list[Shares]()
-    whole = np.ones(len(F), dtype=bool)
+    F, w, n = problem.F.copy(), uv.copy(), problem.n
+    # The added triangles with their parents, and the added vertices with their images, parents and weights.
+    added: list[Refined] = []
+    images = [w]
     for rows, vertices, patch in patches:
         *_, made = constructions(patch, uv[vertices])
         if not made.certificate.bijective:
             return None
-        refined = made.refined
-        numbers = np.append(vertices, n + len(shares) + np.arange(len(refined.parents)))
-        triangles.append(numbers[refined.F])
-        shares += [{int(vertices[old]): share for old, share in row.items()} for row in refined.shares()]
-        uv[vertices] = made.uv[: len(vertices)]
-        moved.append(made.uv[len(vertices) :])
-        whole[rows] = False
-    refined = as_refined(problem.V, F, np.concatenate([F[whole], *triangles]), shares)
-    uv = np.concatenate([uv, *moved])
-    certificate = certify(refined.F, uv, loops=problem.domain.loops)
-    return Construction(refined, uv, certificate, np.empty(0, dtype=np.int64)) if certificate.bijective else None
+        refined, old = made.refined, len(vertices)
+        triangles = np.append(vertices, n + np.arange(len(refined.parents)))[refined.F]
+        n += len(refined.parents)
+        F[rows], w[vertices] = triangles[: len(rows)], made.uv[:old]
+        images.append(made.uv[old:])
+        parent, parents = rows[refined.parent[len(rows) :]], vertices[refined.parents]
+        added.append(Refined(refined.V[old:], triangles[len(rows) :], parent, parents, refined.weights))
+    whole = Refined(
+        np.concatenate([problem.V, *(one.V for one in added)]),
+        np.concatenate([F, *(one.F for one in added)]),
+        np.concatenate([np.arange(len(F)), *(one.parent for one in added)]),
+        np.concatenate([one.parents for one in added]),
+        np.concatenate([one.weights for one in added]),
+    )
+    image = np.concatenate(images)
+    certificate = certify(whole.F, image, loops=problem.domain.loops)
+    return Construction(whole, image, certificate, np.empty(0, dtype=np.int64)) if certificate.bijective else None
 
 
 def _find_patches(problem: Problem, uv: FloatArray, inverted: IntArray) -> list[_PatchProblem] | None:
     """Return patches around the inverted triangles as rows, vertices and problems; None if they are too large."""
     F, n = problem.F, problem.n
-    inside = mark(n, F[inverted])
+    inside, fixed = mark(n, F[inverted]), mark(n, problem.fixed)
+    # A set of triangles grows or stays, so its first triangle and its size identify it.
+    known: dict[tuple[int, int], _PatchProblem | None] = {}
     for _ in range(_LIMITS.min_rings):
         inside |= _add_ring(F, inside)
     for _ in range(_LIMITS.min_rings, _LIMITS.max_rings):
@@ -93,12 +101,14 @@ def _find_patches(problem: Problem, uv: FloatArray, inverted: IntArray) -> list[
         found: list[_PatchProblem] = []
         poor = np.zeros(n, dtype=bool)
         for some in np.split(rows[order], np.flatnonzero(np.diff(label[order])) + 1):
-            vertices, corners = np.unique(F[some], return_inverse=True)
-            patch = _as_problem(problem, uv, vertices, corners.reshape(-1, 3))
+            key = int(some[0]), some.size
+            if key not in known:
+                known[key] = _as_problem(problem, uv, some, fixed)
+            patch = known[key]
             if patch is None:
-                poor[vertices] = True
+                poor[F[some]] = True
             else:
-                found.append(_PatchProblem(some, vertices, patch))
+                found.append(patch)
         if not poor.any():
             return found
         inside |= _add_ring(F, poor)
@@ -110,14 +120,18 @@ def _add_ring(F: IntArray, inside: BoolArray) -> BoolArray:
     return mark(inside.size, F[inside[F].any(axis=1)])
 
 
-def _as_problem(problem: Problem, uv: FloatArray, vertices: IntArray, F: IntArray) -> Problem | None:
-    """Return the problem of a patch, or None if it is no surface or its target is not simple."""
-    fixed = mark(problem.n, problem.fixed)[vertices]
+def _as_problem(problem: Problem, uv: FloatArray, rows: IntArray, fixed: BoolArray) -> _PatchProblem | None:
+    """Return the problem of some triangles, or None if they are no surface or its target is not simple.
+
+    ``fixed`` (n,) marks the problem's fixed vertices.
+    """
+    vertices, corners = np.unique(problem.F[rows], return_inverse=True)
+    V, F = problem.V[vertices], corners.reshape(-1, 3)
+    stays = fixed[vertices]
     try:
-        domain = Domain(problem.V[vertices], F, None)
-        fixed[domain.fixed] = True
-        domain = Domain(problem.V[vertices], F, np.flatnonzero(fixed))
+        stays[Domain(V, F, None).fixed] = True
+        domain = Domain(V, F, np.flatnonzero(stays))
     except ValueError:
         return None
     patch = Problem.on(domain, uv[vertices[domain.fixed]], reference="equilateral")
-    return patch if is_simple(patch) else None
+    return _PatchProblem(rows, vertices, patch) if is_simple(patch) else None
