@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from operator import itemgetter
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -39,9 +39,10 @@ class ConstructionTuning(NamedTuple):
     added_per_vertex: int = 50
     # Final maximum of added vertices: walks around many displaced pins can grow without bound.
     max_added: int = 60_000
-    # Thinning takes long with more added vertices than this. Of several constructions with so many vertices, only the
-    # one with the fewest is thinned.
+    # Cutting and thinning take long with more added vertices than this.
     many_added: int = 1000
+    # A construction with at most so many is also thinned if another one has fewer.
+    few_added: int = 100
 
 
 _TUNING = ConstructionTuning()
@@ -137,11 +138,12 @@ class Construction:
     cut: bool = True
 
 
-def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Construction]:
+def constructions(problem: Problem, best_map: FloatArray, *, patch: bool = False) -> Iterator[Construction]:
     """Yield constructions near the best known map (n, 2) and without a guide, each better than the previous ones.
 
     The target satisfies `is_simple`. At least one construction is yielded; the last one adds the fewest vertices. A
-    certified map is yielded before it is thinned. If all add many vertices, only the one with the fewest is thinned.
+    certified map is yielded before it is thinned. One with many added vertices is the last, and one with more than
+    another is usually not thinned. A mesh usually gets fewer vertices without a guide, a ``patch`` near the best map.
     If every way to cut needs too many vertices, ``best_map`` is yielded with ``cut`` False.
     """
     best: tuple[bool, int] | None = None
@@ -153,13 +155,12 @@ def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Constructi
         best = _rank(made)
         return True
 
-    # Constructions that are not thinned yet, with their ranks.
-    unthinned: list[tuple[tuple[bool, int], Iterator[Construction]]] = []
-    thinned = False
+    fewest, large = inf, False
     # Near a bad map walks may grow without end, because each runs along the previous ones.
     first = _TUNING.added_per_vertex * (problem.n + _TUNING.added_per_vertex)
-    for guide, limit in ((best_map, first), (None, first), (best_map, max(first, _TUNING.max_added))):
-        if best is not None and (limit > first or not best[1]):
+    guides = (best_map, None) if patch else (None, best_map)
+    for guide, limit in (*((guide, first) for guide in guides), (best_map, max(first, _TUNING.max_added))):
+        if best is not None and (limit > first or not best[1] or large):
             break
         steps = construct_and_thin(problem, guide, max_added=limit)
         try:
@@ -168,14 +169,11 @@ def constructions(problem: Problem, best_map: FloatArray) -> Iterator[Constructi
             continue
         if is_better(made):
             yield made
-        if len(made.refined.parents) > _TUNING.many_added:
-            unthinned.append((_rank(made), steps))
-            continue
-        thinned = True
-        yield from filter(is_better, steps)
-    if unthinned and not thinned:
-        _, steps = min(unthinned, key=itemgetter(0))
-        yield from filter(is_better, steps)
+        added = len(made.refined.parents)
+        if added <= max(fewest, _TUNING.few_added):
+            yield from filter(is_better, steps)
+        if made.certificate.bijective:
+            fewest, large = min(added, fewest), added > _TUNING.many_added
     if best is None:
         certificate = certify(problem.F, best_map, loops=problem.domain.loops)
         uncut = as_refined(problem.V, problem.F, problem.F, [])

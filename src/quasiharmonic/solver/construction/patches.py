@@ -61,7 +61,7 @@ def construct_patches(problem: Problem, uv: FloatArray) -> Construction | None:
     added: list[Refined] = []
     images = [w]
     for rows, vertices, patch in patches:
-        *_, made = constructions(patch, uv[vertices])
+        *_, made = constructions(patch, uv[vertices], patch=True)
         if not made.certificate.bijective:
             return None
         refined, old = made.refined, len(vertices)
