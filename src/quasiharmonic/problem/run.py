@@ -165,6 +165,12 @@ def run_until(seconds: float | None, compute: Callable[[], T]) -> T | None:
     return None
 
 
+def finish_result(compute: Callable[[], MapResult]) -> MapResult:
+    """Return the result of a `finish`, ``INTERRUPTED`` if an interrupt has repeated it."""
+    result, interrupted = finish(compute)
+    return replace(result, status=Status.INTERRUPTED) if interrupted else result
+
+
 def run_within(seconds: float | None, compute: Callable[[], MapResult]) -> MapResult:
     """Return the result of a computation that ends after a time limit, if there is one, with the best map so far.
 

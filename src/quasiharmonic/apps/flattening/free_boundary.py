@@ -36,7 +36,7 @@ from quasiharmonic.geometry.mesh.splitting import weld_triangles
 from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.problem.run import Run, run_within
+from quasiharmonic.problem.run import Run, finish_result, run_within
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -215,13 +215,22 @@ def _flatten(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
         held = [part for part, has in zip(free, has_pins, strict=True) if has]
         free = [part for part, has in zip(free, has_pins, strict=True) if not has]
         results.append(flatten_pinned_parts(F, held, *pins, checked, weights, given))
+    # After Ctrl-C the other pieces still need a position, so they get their initial maps.
+    unmoved = replace(checked, max_iterations=0, callback=None)
     for part in free:
-        if results and results[-1].status is Status.INTERRUPTED:
-            # The other pieces still need a position, so they get their initial maps.
-            checked = replace(checked, max_iterations=0, callback=None)
-        results.append(_flatten_part(part, given, weights, checked))
-    uv = _place(len(V), held, free, results, checked.gap)[joint]
-    result = _combine(F, fit_unit_square(uv) if checked.unit_square else uv, held, free, results)
+        stopped = bool(results) and results[-1].status is Status.INTERRUPTED
+        try:
+            results.append(_flatten_part(part, given, weights, unmoved if stopped else checked))
+        except KeyboardInterrupt:
+            if not results or stopped:
+                raise
+            results.append(replace(_flatten_part(part, given, weights, unmoved), status=Status.INTERRUPTED))
+
+    def end() -> MapResult:
+        uv = _place(len(V), held, free, results, checked.gap)[joint]
+        return _combine(F, fit_unit_square(uv) if checked.unit_square else uv, held, free, results)
+
+    result = finish_result(end)
     if not kept.all():
         # Recorded maps are those of a single part, in its numbering.
         number = (np.cumsum(kept) - 1)[joint]

@@ -27,7 +27,7 @@ from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.problem.run import Run
+from quasiharmonic.problem.run import Run, finish, finish_result
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, count_of, find_exponent, pad_to_space, scale_to_unit
 from quasiharmonic.util.options import FlattenOptions
 
@@ -170,12 +170,15 @@ class Flattening:
                 status = self._descend(start)
                 if self._has_collapsed(status):
                     status = self._restart(status)
-        if self._bijective is None:
+        found = self._bijective
+        if found is None:
             raise KeyboardInterrupt
-        uv = self._bijective
-        if is_scale_free(self._measure, in_units(uv, 0)):
-            uv = self._fit_scale(uv)
-        return self._run.result(uv, self._piece.F, status, loops=self._piece.loops, linear_solver=self._solver)
+
+        def end() -> MapResult:
+            uv = self._fit_scale(found) if is_scale_free(self._measure, in_units(found, 0)) else found
+            return self._run.result(uv, self._piece.F, status, loops=self._piece.loops, linear_solver=self._solver)
+
+        return finish_result(end)
 
     def _keep(self, uv: FloatArray) -> Status:
         """Use a bijective map without descending."""
@@ -345,7 +348,7 @@ class Flattening:
         rim = self._rim if guarded else None
         descent = SurfaceDescent(energy, uv, solver, rim=rim, iterate=True, rotations=rotations)
         self._solver = descent.linear_solver
-        apart, status = guarded, Status.STILL_FALLING
+        status = Status.STILL_FALLING
         recent: deque[tuple[float, FloatArray]] = deque(maxlen=_RECENT)
 
         def measure() -> float:
@@ -365,10 +368,8 @@ class Flattening:
 
         name = f"{'guarded' if guarded else 'free'} descent, {energy_name(options)}"
         exponent = self._piece.exponent
-        try:
-            status = self._run.descend(name, take_steps(), measure, lambda: to_given_unit(descent.uv, exponent))
-        finally:
-            # After Ctrl-C too, the current map may be better than the previous one.
+
+        def end() -> tuple[bool, FloatArray | None]:
             apart = guarded or not self._rim.meets_itself(descent.uv)
             pulled = None if apart else self._rim.pull_apart(self._piece.F, descent.uv)
             if apart:
@@ -380,6 +381,15 @@ class Flattening:
                 self._overlapping = descent.uv if status is not Status.STILL_FALLING else None
                 self._bijective = self._latest_bijective(recent, _MAX_ENERGY_RATIO * measure())
             self._run.judge_last_stage(kept=apart or pulled is not None)
+            return apart, pulled
+
+        try:
+            status = self._run.descend(name, take_steps(), measure, lambda: to_given_unit(descent.uv, exponent))
+        finally:
+            # After Ctrl-C too, the current map may be better than the previous one.
+            (apart, pulled), interrupted = finish(end)
+            if interrupted:
+                raise KeyboardInterrupt
         if pulled is None:
             return status if apart else None
         before, after = measure(), self._measure.value(in_units(pulled, 0))
