@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import minimize
 
@@ -266,6 +267,23 @@ def test_deep_folds_of_smooth_noise_move_only_pixels_near_them():
     assert np.array_equal(mended.field[~mended.moved_mask], field[~mended.moved_mask])
     assert mended.moved_mask.sum() < 1200
     assert mended.distance < 0.0385
+
+
+def test_every_patch_of_moved_pixels_has_a_fold():
+    """Some cells near the bound are in patches while these descend, without being folds."""
+    dice = np.random.default_rng(0)
+    field = np.stack([gaussian_filter(dice.normal(size=(120, 160)), 8) for _ in range(2)], axis=-1)
+    field *= 4.7 / field.std()
+    result = nearest_invertible(field)
+    assert result.folds > 300
+    moved, folded = (result.field != field).any(axis=-1), np.zeros(field.shape[:2], dtype=bool)
+    for y, x in np.argwhere((determinants(field) <= 0.01).any(axis=0)):
+        folded[y : y + 2, x : x + 2] = True
+    patch, count = ndimage.label(moved, np.ones((3, 3)))
+    assert count > 1
+    assert np.isin(np.arange(1, count + 1), patch[folded]).all()
+    assert ndimage.distance_transform_edt(~folded)[moved].max() < 12
+    assert determinants(result.field).min() > 0.01
 
 
 def test_the_penalty_of_folds_has_correct_derivatives():

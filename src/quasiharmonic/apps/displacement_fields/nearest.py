@@ -48,8 +48,6 @@ class NearestTuning(NamedTuple):
 
     # Coefficients of at most this multiple of a bound of their terms may be rounding errors.
     rounding: float = 2.0**-46
-    # Pixels closer than this to their original position, in pixels, return to it.
-    return_distance: float = 1e-6
     # Maximum number of times that patches grow.
     max_rounds: int = 12
 
@@ -297,8 +295,9 @@ def _descend(grid: PixelGrid, given: ComplexArray, fixed: BoolArray, min_jacobia
         ) from none
     moving = patch
     for _ in range(_TUNING.max_rounds):
-        descend_patches(grid, w, given, moving, min_jacobian)
-        _return_near_pixels(grid, w, given, min_jacobian)
+        shrunk = descend_patches(grid, w, given, moving, min_jacobian)
+        patch[(moving > 0) & (shrunk == 0)] = 0
+        moving = shrunk
         grown = grow_pressing(w != given, moving, fixed)
         if not (grown & (patch == 0)).any():
             break
@@ -306,11 +305,3 @@ def _descend(grid: PixelGrid, given: ComplexArray, fixed: BoolArray, min_jacobia
         moving = np.where(np.isin(patch, np.unique(patch[grown])), patch, 0)
     return w
 
-
-def _return_near_pixels(grid: PixelGrid, w: ComplexArray, given: ComplexArray, min_jacobian: float) -> None:
-    """Return pixels that are nearly at their original positions to them, unless this makes a fold."""
-    close = (w != given) & (np.abs(w - given) < _TUNING.return_distance)
-    before = w[close]
-    w[close] = given[close]
-    if find_folds(grid, w, min_jacobian).any():
-        w[close] = before

@@ -10,6 +10,7 @@ and its first two derivatives vanish. So only the first term acts on pixels whos
 them exactly to their positions under the given field. κ decreases in steps, until the barrier's effect is negligible.
 
 Patches share one block-diagonal matrix and Newton's direction. Step length and convergence are determined per patch.
+Large patches shrink to the surroundings of the pixels that move.
 
 The start is a map without folds that agrees with the field outside patches around the folds. The pixels of folded cells
 and some pixels around them become free, with harmonic displacements. Where the result still folds, the given map itself
@@ -60,6 +61,9 @@ class PatchTuning(NamedTuple):
         (1e-5, width, 40),
     )
     large: int = 5_000
+    # Pixels closer than this to their original position, in pixels, return to it. In large patches they return earlier.
+    return_distance: float = 1e-5
+    return_early: float = 1e-2
     # The penalty's weights in turn.
     penalties: tuple[float, ...] = (1e-2, 1e-1, 1.0, 10.0, 100.0)
     # A patch has converged if Newton's model predicts a decrease below this fraction of its value.
@@ -146,16 +150,38 @@ class FoldPenalty(_OfDeterminant):
 
 def descend_patches(
     grid: PixelGrid, w: ComplexArray, given: ComplexArray, patch: IntArray, min_jacobian: float
-) -> None:
+) -> IntArray:
     """Move the free pixels as near to their positions under a given field as possible.
 
     ``w`` (h, w) complex128 is changed in place. It is a map in the grid's unit whose determinants are above
     ``min_jacobian`` at all corners of cells with free pixels. ``given`` (h, w) is the given map, and ``patch`` (h, w)
-    the patch of each free pixel, from 1 on; 0 for fixed pixels.
+    the patch of each free pixel, from 1 on; 0 for fixed pixels. Return the patches of the pixels that were free at the
+    end: large patches shrink to the surroundings of the pixels that move.
     """
     large = np.bincount(patch.ravel())[1:].max(initial=0) > _TUNING.large
     for weight, width, steps in _TUNING.wide_barriers if large else _TUNING.barriers:
         _descend_batches(_Patches(grid, w, given, patch, ThinBarrier(min_jacobian, width)), weight, steps)
+        if large:
+            return_pixels(grid, w, given, min_jacobian, _TUNING.return_early)
+            patch = label_patches(grow(w != given, _TUNING.margin, patch == 0))
+    return_pixels(grid, w, given, min_jacobian, _TUNING.return_distance)
+    return patch
+
+
+def return_pixels(
+    grid: PixelGrid, w: ComplexArray, given: ComplexArray, min_jacobian: float, distance: float
+) -> None:
+    """Return pixels to their original positions: patches without folds, and those nearly there where none arises."""
+    patch = label_patches(w != given)
+    needed = patch[find_points(find_folds(grid, given, min_jacobian))]
+    needless = (patch > 0) & ~np.isin(patch, np.unique(needed))
+    w[needless] = given[needless]
+    close = (w != given) & (np.abs(w - given) < distance)
+    before = w.copy()
+    w[close] = given[close]
+    while (folded := find_points(find_folds(grid, w, min_jacobian)) & close).any():
+        w[folded] = before[folded]
+        close &= ~folded
 
 
 class _Patches(NamedTuple):
