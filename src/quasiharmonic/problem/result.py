@@ -311,7 +311,8 @@ class MapResult(ReadOnly, Displayable, Outcome):
     stages : list of Stage
         The stages that ran, in order.
     history : list of Step
-        Number of inverted triangles and energy at every iteration.
+        Number of inverted triangles and energy at every iteration. `flatten` of several pieces lists one piece after
+        another, each with its own energy.
     diagnosis : Diagnosis or None
         Obstructions to a map, if no map was found.
     linear_solver : str
