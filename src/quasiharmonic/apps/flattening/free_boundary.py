@@ -218,12 +218,12 @@ def _flatten(V: ArrayLike, F: ArrayLike, checked: FlattenOptions) -> MapResult:
     # After Ctrl-C the other pieces still need a position, so they get their initial maps.
     unmoved = replace(checked, max_iterations=0, callback=None)
     for part in free:
-        stopped = bool(results) and results[-1].status is Status.INTERRUPTED
-        try:
+        stopped, run = bool(results) and results[-1].status is Status.INTERRUPTED, Run()
+        with run.until_interrupted():
             results.append(_flatten_part(part, given, weights, unmoved if stopped else checked))
-        except KeyboardInterrupt:
-            if not results or stopped:
-                raise
+        if run.interrupted:
+            if stopped or not results:
+                raise KeyboardInterrupt
             results.append(replace(_flatten_part(part, given, weights, unmoved), status=Status.INTERRUPTED))
 
     def end() -> MapResult:

@@ -46,8 +46,9 @@ _RECENT = 12
 _MAX_ENERGY_RATIO = 10.0
 # A free descent checks its boundary every so many steps.
 _CHECK_EVERY = 8
-# It stops if edges at this fraction of the boundary vertices intersect: such boundaries do not separate again.
-_TANGLED = 0.1
+# It stops if edges at this fraction of the boundary vertices intersect, unless the mean energy is above the second
+# number and has fallen below the third fraction since the last check: other boundaries do not separate again.
+_TANGLED, _ISOMETRIC, _FALLING = 0.1, 0.02, 0.95
 # A map whose overlaps were pulled apart is the result if its energy has grown by at most this factor, plus this amount.
 _MAX_PULLED_RATIO, _LEAST_PULLED = 1.001, 1e-6
 # Descents from different initial maps agree if their energies differ by at most this fraction.
@@ -357,12 +358,14 @@ class Flattening:
         def take_steps() -> Iterator[Status | None]:
             patches = None if guarded else PatchDescents(self._measure, solver).improve
             course = descend(descent, self._density, options.tol, patches)
+            last = np.inf
             for number, outcome in enumerate(itertools.islice(course, options.max_iterations), 1):
                 recent.append((measure(), descent.uv))
                 yield outcome
-                tangled = (
-                    not guarded and number % _CHECK_EVERY == 0 and self._rim.tangled_fraction(descent.uv) > _TANGLED
-                )
+                if guarded or number % _CHECK_EVERY:
+                    continue
+                falls, last = _ISOMETRIC < recent[-1][0] < _FALLING * last, recent[-1][0]
+                tangled = not falls and self._rim.tangled_fraction(descent.uv) > _TANGLED
                 if tangled and self._rim.pull_apart(self._piece.F, descent.uv) is None:
                     return
 
