@@ -304,4 +304,3 @@ def _descend(grid: PixelGrid, given: ComplexArray, fixed: BoolArray, min_jacobia
         patch = label_patches(grown | (patch > 0))
         moving = np.where(np.isin(patch, np.unique(patch[grown])), patch, 0)
     return w
-

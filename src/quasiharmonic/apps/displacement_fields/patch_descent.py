@@ -168,9 +168,7 @@ def descend_patches(
     return patch
 
 
-def return_pixels(
-    grid: PixelGrid, w: ComplexArray, given: ComplexArray, min_jacobian: float, distance: float
-) -> None:
+def return_pixels(grid: PixelGrid, w: ComplexArray, given: ComplexArray, min_jacobian: float, distance: float) -> None:
     """Return pixels to their original positions: patches without folds, and those nearly there where none arises."""
     patch = label_patches(w != given)
     needed = patch[find_points(find_folds(grid, given, min_jacobian))]
