@@ -13,7 +13,8 @@ from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descen
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.surfaces import annulus, grid
+from quasiharmonic.results import Status
+from quasiharmonic.surfaces import annulus, disk, grid
 
 
 def horseshoe(gap):
@@ -221,3 +222,18 @@ def test_guarded_steps_stay_bijective(surface):
         values.append(descent.distortion)
         assert certify(F, descent.uv).bijective
     assert values[-1] <= values[0]
+
+
+def test_a_tangled_boundary_stops_a_free_descent_only_if_its_energy_no_longer_falls(monkeypatch):
+    V, F = disk(12)
+    x, y = V.T
+    wavy = np.stack([3 * x, y, 2 * np.sin(5 * x) * np.cos(4 * y)], axis=1)
+    monkeypatch.setattr(Rim, "tangled_fraction", lambda self, uv: 1.0)
+    monkeypatch.setattr(Rim, "pull_apart", lambda self, F, uv: None)
+    result = flatten(wavy, F, start=V * [1, 1e-6], tol=1e-16)
+    # The boundary is checked after 8, 16 and 24 steps.
+    assert result.status is Status.STILL_FALLING
+    assert [stage.n_iterations for stage in result.stages] == [24]
+    before, after = (step.energy for step in (result.history[16], result.history[24]))
+    assert after > 0.95 * before
+    assert result.history[16].energy < 0.95 * result.history[8].energy
