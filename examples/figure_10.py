@@ -8,7 +8,6 @@ V₃ solves most of the thirty problems, V₁ and V₄ few; in the paper all thr
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,9 +16,6 @@ from common import BENCHMARKS, mips, panels, run, save, show
 from quasiharmonic import Problem, solve, targets
 from quasiharmonic.solver.methods import LBFGS
 from sculptures import sculpture
-
-sys.path.append(str(BENCHMARKS))
-from recorded import RECORDS
 
 SURFACES = "angel", "gargoyle", "rabbit", "bust", "hand"
 LETTERS = "GSRAPH"
@@ -40,7 +36,7 @@ class LetterRun(NamedTuple):
     cpu_seconds: float
 
 
-def read_letters_alone(path: Path = RECORDS / "letters_alone.csv") -> list[LetterRun]:
+def read_letters_alone(path: Path = BENCHMARKS / "records" / "letters_alone.csv") -> list[LetterRun]:
     """Return the runs of L-BFGS alone."""
     with path.open(newline="", encoding="utf-8") as file:
         return [

@@ -24,10 +24,10 @@ def bump(h, w, x, y, width, push):
     return np.exp(-(at**2).sum(axis=2) / (2 * width**2))[..., None] * np.array(push, dtype=float)
 
 
-def wobble(h, w, size, seed=0):
+def wobble(h, w, size, seed=0, width=4):
     """Return a smooth random field."""
     dice = np.random.default_rng(seed)
-    return np.stack([gaussian_filter(dice.normal(size=(h, w)), 4) for _ in range(2)], axis=-1) * size
+    return np.stack([gaussian_filter(dice.normal(size=(h, w)), width) for _ in range(2)], axis=-1) * size
 
 
 def determinants(field):
@@ -258,8 +258,7 @@ def test_invalid_options():
 
 @pytest.mark.slow
 def test_deep_folds_of_smooth_noise_move_only_pixels_near_them():
-    dice = np.random.default_rng(1)
-    field = np.stack([gaussian_filter(dice.normal(size=(200, 260)), 8) for _ in range(2)], axis=-1)
+    field = wobble(200, 260, 1, 1, 8)
     field *= 4.11 / field.std()
     mended = nearest_invertible(field)
     assert mended.folds > 300
@@ -271,8 +270,7 @@ def test_deep_folds_of_smooth_noise_move_only_pixels_near_them():
 
 def test_every_patch_of_moved_pixels_has_a_fold():
     """Some cells near the bound are in patches while these descend, without being folds."""
-    dice = np.random.default_rng(0)
-    field = np.stack([gaussian_filter(dice.normal(size=(120, 160)), 8) for _ in range(2)], axis=-1)
+    field = wobble(120, 160, 1, 0, 8)
     field *= 4.7 / field.std()
     result = nearest_invertible(field)
     assert result.folds > 300

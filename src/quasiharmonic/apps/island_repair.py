@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.energies.polishing import polish_map
+from quasiharmonic.geometry.coarsening import mark_rings
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.reference import rest_shapes
@@ -112,10 +113,8 @@ class IslandRepair:
 
     def _find_near(self, triangles: IntArray, rings: int) -> BoolArray:
         """Interior vertices within a number of rings of triangles; the triangles' own vertices are the first ring."""
-        near: BoolArray = mark(len(self.uv), self._F[triangles])
-        for _ in range(rings - 1):
-            near[self._F[near[self._F].any(axis=1)]] = True
-        return near & ~self._fixed
+        near: BoolArray = mark_rings(self._F, mark(len(self.uv), self._F[triangles]), rings - 1) & ~self._fixed
+        return near
 
     def _components(self, free: BoolArray) -> Iterator[BoolArray]:
         """Split free vertices into the sets that edges connect."""

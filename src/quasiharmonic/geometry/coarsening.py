@@ -299,6 +299,14 @@ def has_marked_corner(T: IntArray, marked: BoolArray) -> BoolArray:
     return any_corner(marked.take(T))
 
 
+def mark_rings(F: IntArray, marked: BoolArray, rings: int = 1) -> BoolArray:
+    """Return the marked vertices (n,) and those of some rings of triangles (f, 3) around them."""
+    marked = marked.copy()
+    for _ in range(rings):
+        marked[F[has_marked_corner(F, marked)]] = True
+    return marked
+
+
 def _removals(names: IntArray, vertices: IntArray, rings: IntArray, of_degree: IntArray) -> list[Removal]:
     """The removals of a round, with the vertex numbers of the fine mesh."""
     found, done = [], 0

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.splitting import fans, find_representatives, number_fans, renumber
-from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, group_by_label, pair_keys
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -167,9 +167,8 @@ class SeamedMesh:
         """
         places = np.full((int(self.FT.max(initial=-1)) + 1, 2), np.nan) if self.uv is None else self.uv
         split, island = fans(self._welded)
-        by_island = np.argsort(island, kind="stable")
         found = []
-        for rows in np.split(by_island, np.flatnonzero(np.diff(island[by_island])) + 1) if by_island.size else []:
+        for rows in group_by_label(island):
             triangles = self.mapped[rows]
             of_mesh, at = self.F[triangles].ravel(), self.FT[triangles].ravel()
             own, first = renumber(split[rows], self.F[triangles])

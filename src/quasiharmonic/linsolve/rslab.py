@@ -106,7 +106,9 @@ class Rslab(LinearSolver):
 
     def _solve_columns(self, b: FloatArray) -> Any:
         """Solve with rslab's factor, for large systems with a thread for each column."""
-        if b.shape[1] > 1 and self.n < SEQUENTIAL_BELOW:
+        if b.shape[1] == 1:
+            return self._numeric.solve(b[:, 0])[:, None]
+        if self.n < SEQUENTIAL_BELOW:
             return self._numeric.solve_many(b)
         with make_executor(min(b.shape[1], _threads()), "quasiharmonic: solves") as threads:
             return np.stack([*threads.map(self._numeric.solve, b.T)], axis=1)

@@ -8,9 +8,9 @@ in several attempts::
 
 An attempt is made only if those before it found no map. The construction takes little time, and a failing search
 takes long. The construction is therefore made as soon as the first stages of the search fail, if the target is simple;
-only around the inverted triangles, if these are few.
-The number of vertices that it adds determines whether the attempts in between are worth their time. If they are, they
-get a reduced budget. The construction is used if they fail or add more vertices.
+only around the inverted triangles, if these are few. The number of vertices that it adds determines whether the
+attempts in between are worth their time. If they are, they get a reduced budget. The construction is used if they fail
+or add more vertices.
 
 All attempts share the iterations of one search and its budget for failed repairs. Random restarts cost the most, so
 they run on the given mesh only.

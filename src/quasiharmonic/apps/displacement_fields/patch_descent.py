@@ -162,13 +162,13 @@ def descend_patches(
     for weight, width, steps in _TUNING.wide_barriers if large else _TUNING.barriers:
         _descend_batches(_Patches(grid, w, given, patch, ThinBarrier(min_jacobian, width)), weight, steps)
         if large:
-            return_pixels(grid, w, given, min_jacobian, _TUNING.return_early)
+            _return_pixels(grid, w, given, min_jacobian, _TUNING.return_early)
             patch = label_patches(grow(w != given, _TUNING.margin, patch == 0))
-    return_pixels(grid, w, given, min_jacobian, _TUNING.return_distance)
+    _return_pixels(grid, w, given, min_jacobian, _TUNING.return_distance)
     return patch
 
 
-def return_pixels(grid: PixelGrid, w: ComplexArray, given: ComplexArray, min_jacobian: float, distance: float) -> None:
+def _return_pixels(grid: PixelGrid, w: ComplexArray, given: ComplexArray, min_jacobian: float, distance: float) -> None:
     """Return pixels to their original positions: patches without folds, and those nearly there where none arises."""
     patch = label_patches(w != given)
     needed = patch[find_points(find_folds(grid, given, min_jacobian))]

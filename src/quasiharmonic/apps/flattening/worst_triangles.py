@@ -29,7 +29,7 @@ from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.geometry.coarsening import has_marked_corner
+from quasiharmonic.geometry.coarsening import has_marked_corner, mark_rings
 from quasiharmonic.geometry.mesh.reference import rest_frames, rest_shapes
 from quasiharmonic.geometry.prolongation import are_positive
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, to_points
@@ -89,10 +89,7 @@ def descend_on_patches(
 
 def mark_around(F: IntArray, triangles: BoolArray, n: int) -> BoolArray:
     """Return a mask (n,) of the vertices of some triangles (f,), and of some rings of triangles around them."""
-    loose = mark(n, F[triangles])
-    for _ in range(_PATCH.rings):
-        loose[F[has_marked_corner(F, loose)]] = True
-    return loose
+    return mark_rings(F, mark(n, F[triangles]), _PATCH.rings)
 
 
 class PatchDescents:

@@ -20,7 +20,7 @@ from quasiharmonic.geometry.exact import certificate
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.loops import LoopEdges, Obstacle
 from quasiharmonic.geometry.exact.predicates import box_pairs
-from quasiharmonic.geometry.mesh.topology import edge_keys, find_twins, label_components
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_twins, group_by_label, label_components
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of, repeat_each
 from quasiharmonic.util.outcome import Verdict
@@ -174,8 +174,7 @@ def _find_faults(
     F: IntArray, uv: FloatArray, chart: IntArray, chart_of_vertex: IntArray, whole: Certificate
 ) -> tuple[BoolArray, IntArray]:
     """Return which charts are bijective, and which pairs overlap, of charts that are not all bijective together."""
-    order = np.argsort(chart, kind="stable")
-    parts = np.split(F[order], np.flatnonzero(np.diff(chart[order])) + 1)
+    parts = [F[rows] for rows in group_by_label(chart)]
 
     def is_bijective(*rows: IntArray) -> bool:
         used, own = np.unique(np.concatenate(rows), return_inverse=True)

@@ -23,7 +23,7 @@ from quasiharmonic.apps.unwrapping.unrolling import SAME, meet
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
-from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.geometry.mesh.topology import boundary_loops, group_by_label
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_points
 
 # Rounds with a larger loss than this are left out if there are more charts than `MAX_COMPARED`: the choice between
@@ -169,7 +169,7 @@ class PaperModel:
         self._joined_sides = hinges.mark_sides(pieces.glued, len(F)).ravel()
         self._side = np.sqrt(area / _EXPECTED)
         self._unit = _GAP * np.sqrt(area)
-        groups = _group_by_label(pieces.label)
+        groups = group_by_label(pieces.label)
         self._charts = {k: _Leaf(rows, pieces.place[rows].ravel()) for k, rows in enumerate(groups)}
         # The charts that were listed last, by label.
         self._known: dict[int, Chart] = {}
@@ -360,7 +360,7 @@ class PaperModel:
         """Return the joined pieces as charts, by their labels."""
         pieces, known = self._pieces, self._known
         charts = []
-        for rows in _group_by_label(pieces.label):
+        for rows in group_by_label(pieces.label):
             label = int(pieces.label[rows[0]])
             # A label keeps its triangles unless more are joined to them.
             if label not in known or len(known[label].triangles) != rows.size:
@@ -373,10 +373,3 @@ class PaperModel:
     def _split(self, rows: IntArray) -> IntArray:
         """Return some triangles (k, 3) by vertices of their own, joined at the glued hinges only."""
         return fans(self._F[rows], ~self._joined_sides.reshape(-1, 3)[rows])[0]
-
-
-def _group_by_label(label: IntArray) -> list[IntArray]:
-    """Return the triangles (k,) with each label (f,) that is not negative, by ascending labels."""
-    order = np.argsort(label, kind="stable")
-    order = order[label[order] >= 0]
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if order.size else []

@@ -16,7 +16,7 @@ from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.loops import simple_loops
 from quasiharmonic.geometry.mesh.reference import area_vectors, rest_frames
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
-from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys, group_by_label
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 
 #: Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
@@ -184,8 +184,7 @@ def unfold_small_components(
     if not rows.size:
         return mask, charts
     split, component, uv, good = _unfold(V, F[rows], undivided[rows])
-    order = np.argsort(component, kind="stable")
-    for k, some in enumerate(np.split(order, np.flatnonzero(np.diff(component[order])) + 1)):
+    for k, some in enumerate(group_by_label(component)):
         if good[k]:
             own, corner = renumber(split[some], F[rows[some]])
             vertices = F[rows[some]].ravel()[corner]

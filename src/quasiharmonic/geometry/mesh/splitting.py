@@ -21,6 +21,7 @@ from quasiharmonic.geometry.mesh.topology import (
     are_sides,
     edge_keys,
     find_pairs,
+    group_by_label,
     label_components,
     mark_sides,
     pair_keys,
@@ -148,9 +149,8 @@ def make_fans(loops: Sequence[IntArray], n: int) -> IntArray:
 def split_parts(F: IntArray, rows: IntArray, cut: IntArray, n: int) -> list[tuple[IntArray, IntArray, IntArray]]:
     """Split triangles along edges (l, 2); return rows, triangles by own vertices, and vertices of each part."""
     split, component = fans(F, mark_sides(F, cut, n))
-    order = np.argsort(component, kind="stable")
     parts = []
-    for some in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
+    for some in group_by_label(component):
         own, corner = renumber(split[some], F[some])
         parts.append((rows[some], own, F[some].ravel()[corner]))
     return parts

@@ -321,6 +321,13 @@ def label_components(tail: IntArray, head: IntArray, n: int) -> IntArray:
     return label
 
 
+def group_by_label(label: IntArray) -> list[IntArray]:
+    """Return the elements (k,) with each label (f,) that is not negative, by ascending labels."""
+    order = np.argsort(label, kind="stable")
+    order = order[label[order] >= 0]
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if order.size else []
+
+
 @compiled
 def link_nodes(tail: IntArray, head: IntArray, label: IntArray) -> int:
     """Fill in the smallest node of every node's component (n,); return 0 if a link is out of range, else 1."""

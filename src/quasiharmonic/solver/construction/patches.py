@@ -14,12 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quasiharmonic.geometry.coarsening import mark_rings
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.mesh.splitting import Refined
-from quasiharmonic.geometry.mesh.topology import label_components
+from quasiharmonic.geometry.mesh.topology import group_by_label, label_components
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.solver.construction.constructing import Construction, constructions, is_simple
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
+from quasiharmonic.solver.methods.local_repair import Patch
+from quasiharmonic.util.arrays import FloatArray, IntArray, mark
 
 
 class PatchLimits(NamedTuple):
@@ -86,24 +88,22 @@ def construct_patches(problem: Problem, uv: FloatArray) -> Construction | None:
 def _find_patches(problem: Problem, uv: FloatArray, inverted: IntArray) -> list[_PatchProblem] | None:
     """Return patches around the inverted triangles as rows, vertices and problems; None if they are too large."""
     F, n = problem.F, problem.n
-    inside, fixed = mark(n, F[inverted]), mark(n, problem.fixed)
+    inside = mark_rings(F, mark(n, F[inverted]), _LIMITS.min_rings)
     # A set of triangles grows or stays, so its first triangle and its size identify it.
     known: dict[tuple[int, int], _PatchProblem | None] = {}
-    for _ in range(_LIMITS.min_rings):
-        inside |= _add_ring(F, inside)
     for _ in range(_LIMITS.min_rings, _LIMITS.max_rings):
         rows = np.flatnonzero(inside[F].all(axis=1))
         if rows.size > _LIMITS.max_share * len(F):
             return None
         T = F[rows]
         label = label_components(T[:, :2], T[:, 1:], n)[T[:, 0]]
-        order = np.argsort(label, kind="stable")
         found: list[_PatchProblem] = []
         poor = np.zeros(n, dtype=bool)
-        for some in np.split(rows[order], np.flatnonzero(np.diff(label[order])) + 1):
+        for group in group_by_label(label):
+            some = rows[group]
             key = int(some[0]), some.size
             if key not in known:
-                known[key] = _as_problem(problem, uv, some, fixed)
+                known[key] = _as_problem(problem, uv, some)
             patch = known[key]
             if patch is None:
                 poor[F[some]] = True
@@ -111,27 +111,16 @@ def _find_patches(problem: Problem, uv: FloatArray, inverted: IntArray) -> list[
                 found.append(patch)
         if not poor.any():
             return found
-        inside |= _add_ring(F, poor)
+        inside |= mark_rings(F, poor)
     return None
 
 
-def _add_ring(F: IntArray, inside: BoolArray) -> BoolArray:
-    """Mark the vertices (n,) of all triangles that have a marked one."""
-    return mark(inside.size, F[inside[F].any(axis=1)])
-
-
-def _as_problem(problem: Problem, uv: FloatArray, rows: IntArray, fixed: BoolArray) -> _PatchProblem | None:
-    """Return the problem of some triangles, or None if they are no surface or its target is not simple.
-
-    ``fixed`` (n,) marks the problem's fixed vertices.
-    """
-    vertices, corners = np.unique(problem.F[rows], return_inverse=True)
-    V, F = problem.V[vertices], corners.reshape(-1, 3)
-    stays = fixed[vertices]
+def _as_problem(problem: Problem, uv: FloatArray, rows: IntArray) -> _PatchProblem | None:
+    """Return the problem of some triangles, or None if they are no surface or its target is not simple."""
+    patch = Patch.of(problem.F[rows], problem.fixed)
     try:
-        stays[Domain(V, F, None).fixed] = True
-        domain = Domain(V, F, np.flatnonzero(stays))
+        domain = Domain(problem.V[patch.vertices], patch.F, np.flatnonzero(patch.fixed))
     except ValueError:
         return None
-    patch = Problem.on(domain, uv[vertices[domain.fixed]], reference="equilateral")
-    return _PatchProblem(rows, vertices, patch) if is_simple(patch) else None
+    own = Problem.on(domain, uv[patch.vertices[domain.fixed]], reference="equilateral")
+    return _PatchProblem(rows, patch.vertices, own) if is_simple(own) else None

@@ -13,6 +13,7 @@ from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
+from quasiharmonic.geometry.coarsening import mark_rings
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.problem import Problem
@@ -198,7 +199,7 @@ def patch_around(problem: Problem, triangle: int, rings: int, max_triangles: int
     """Return the triangles within some rings of one; None if they are too many or have no free vertex."""
     inside = mark(problem.n, problem.F[triangle])
     for _ in range(rings):
-        inside[problem.F[inside[problem.F].any(axis=1)]] = True
+        inside = mark_rings(problem.F, inside)
         # Connected triangles have at most two vertices each, plus one; this bound avoids visiting all triangles at a
         # hub.
         if np.count_nonzero(inside) > 2 * max_triangles + 1:

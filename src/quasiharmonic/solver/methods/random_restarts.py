@@ -19,6 +19,7 @@ from typing import ClassVar, NamedTuple, TypeAlias
 import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
+from quasiharmonic.geometry.coarsening import mark_rings
 from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
@@ -159,7 +160,7 @@ def _choose_position(rng: Generator, problem: Problem, patch: Patch, w: ComplexA
     """
     near = mark(len(w), patch.F[signed_areas(patch.F, w) <= 0])
     if rng.random() < 0.5:
-        near[patch.F[near[patch.F].any(axis=1)]] = True
+        near = mark_rings(patch.F, near)
     candidates = np.flatnonzero(near & ~patch.fixed)
     if not candidates.size:
         return None

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from quasiharmonic.geometry.coarsening import has_marked_corner
+from quasiharmonic.geometry.coarsening import has_marked_corner, mark_rings
 from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, pair_keys, pair_sides
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, pad_to_space, repeat_each, scale_to_unit
@@ -176,10 +176,7 @@ class EdgeGraph:
 
 def triangles_near(F: IntArray, marked: BoolArray, rings: int) -> BoolArray:
     """Mask (f,) of the triangles around marked vertices (n,): for one ring, all that have a marked corner."""
-    marked = marked.copy()
-    for _ in range(rings - 1):
-        marked[F[has_marked_corner(F, marked)]] = True
-    return has_marked_corner(F, marked)
+    return has_marked_corner(F, mark_rings(F, marked, rings - 1))
 
 
 def find_distinct(values: IntArray) -> IntArray:
