@@ -103,6 +103,12 @@ class DeformationEnergy:
             self.share = self.share * array
         self._det_per_area = scale**2 / shapes.m
 
+    def with_density(self, energy: Energy) -> DeformationEnergy:
+        """Return an energy of the same triangles with the same weights and another density."""
+        other = copy(self)
+        other.energy = energy
+        return other
+
     def with_references(
         self, energy: Energy, s: ComplexArray, c: ComplexArray, det: FloatArray, share: FloatArray
     ) -> DeformationEnergy:
@@ -111,8 +117,8 @@ class DeformationEnergy:
         The new rest shape of each triangle is the image of the old one under ``s z + c z̄``, s and c (f,) complex128.
         It has ``det`` (f,) times the old area.
         """
-        other = copy(self)
-        other.energy, other.share = energy, share
+        other = self.with_density(energy)
+        other.share = share
         other.g = (s * self.g - c * self.g.conj()) / det
         other._det_per_area = self._det_per_area / det
         return other
@@ -122,8 +128,8 @@ class DeformationEnergy:
 
         Their weights do not change, so values of both energies with the same density differ by the other triangles.
         """
-        part = copy(self)
-        part.energy, part.F, part._vertex_count = energy, own_triangles(F), int(F.max(initial=-1)) + 1
+        part = self.with_density(energy)
+        part.F, part._vertex_count = own_triangles(F), int(F.max(initial=-1)) + 1
         part.g, part.share = np.ascontiguousarray(self.g[:, triangles]), self.share[triangles]
         part._det_per_area = self._det_per_area[triangles]
         return part

@@ -91,6 +91,8 @@ class Qdldl(LinearSolver):
     # QDLDL always orders by minimum degree, which breaks ties by index. A regular mesh numbered by dissection takes 1.5
     # to 2.5 times as long to factor as the same mesh numbered row by row.
     takes_order = False
+    _library: Any
+    _solver: Any
 
     def _analyse(self) -> None:
         import qdldl
@@ -100,18 +102,19 @@ class Qdldl(LinearSolver):
         entries = np.arange(self.nnz, dtype=np.float64)
         by_columns = csr_array((entries, self._indices, self._indptr), shape=(self.n, self.n)).tocsc()
         self._source = by_columns.data.astype(np.intp)
-        # QDLDL factors during its analysis, so it gets the identity, stored explicitly on the whole pattern.
-        identity = np.zeros(self.nnz)
-        identity[self._indptr[:-1]] = 1.0
         # The package accepts sparse matrices and rejects sparse arrays.
-        data = identity[self._source]
+        data = np.empty(self.nnz)
         self._matrix = csc_matrix((data, by_columns.indices, by_columns.indptr), shape=(self.n, self.n))
-        self._solver: Any = qdldl.Solver(self._matrix, upper=True)
+        # QDLDL's analysis includes a factorisation, so it gets the first matrix.
+        self._library, self._solver = qdldl, None
 
     def _factor(self) -> None:
         np.take(self._values, self._source, out=self._matrix.data, mode="clip")  # the mode that needs no buffer
         try:
-            self._solver.update(self._matrix, upper=True)
+            if self._solver is None:
+                self._solver = self._library.Solver(self._matrix, upper=True)
+            else:
+                self._solver.update(self._matrix, upper=True)
         except RuntimeError:
             raise NotPositiveDefinite("the matrix is not positive definite: QDLDL found a pivot that is zero") from None
         # LDLᵀ exists for indefinite matrices as well, and QDLDL may continue after a zero pivot without an error. Only

@@ -6,7 +6,7 @@ import itertools
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from quasiharmonic.apps.flattening.rigid_steps import ALMOST_FROM, AlmostIsometr
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import PatchDescents, has_collapsed, thin_triangles
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
-from quasiharmonic.energies.energies import Energy
+from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.line_search import RotationPath
 from quasiharmonic.energies.newton.map_model import in_units
@@ -126,7 +126,14 @@ class Piece:
 
     def energy(self, density: Energy, weights: FloatArray | None) -> DeformationEnergy:
         """Return the energy of the piece's maps."""
-        return DeformationEnergy(self.V, self.F, density, weights=weights)
+        if weights is not None:
+            return DeformationEnergy(self.V, self.F, density, weights=weights)
+        return self._reference.with_density(density)
+
+    @cached_property
+    def _reference(self) -> DeformationEnergy:
+        """An energy that knows the rest shapes of the triangles."""
+        return DeformationEnergy(self.V, self.F, SymmetricDirichlet())
 
 
 @dataclass

@@ -36,7 +36,7 @@ from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
 from quasiharmonic.apps.unwrapping.triangle_moves import join_small_charts, move_teeth
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_pairs
 from quasiharmonic.util.arrays import mark
 from quasiharmonic.util.progress import heartbeat, keep_time_limit
 from quasiharmonic.util.threads import HAS_THREADS, count_cores, make_executor
@@ -249,9 +249,8 @@ def close_slits(chart: WorkingChart) -> WorkingChart | None:
     injective map.
     """
     assert chart.uv is not None
-    size = len(chart.V)
     tail, head = chart.F.ravel(), chart.F[:, (1, 2, 0)].ravel()
-    rim = np.flatnonzero(~np.isin(tail * size + head, head * size + tail))
+    rim = np.flatnonzero(~mark(chart.F.size, *find_pairs(chart.F)))
     edge = edge_keys(chart.vertices[tail[rim]], chart.vertices[head[rim]], int(chart.vertices.max()) + 1)
     order = np.argsort(edge, kind="stable")
     first = np.flatnonzero(np.diff(edge[order]) == 0)

@@ -105,7 +105,7 @@ class _Parts:
     def __init__(self, F: IntArray, hinges: Hinges, joined: BoolArray, angles: FloatArray, area: FloatArray) -> None:
         self.joined = joined
         open_sides = ~hinges.mark_sides(joined, len(F))
-        self.split, self.component = fans(F, open_sides)
+        self.split, self.component = fans(F, pairs=(hinges.one[joined], hinges.other[joined]))
         self.count = int(self.component.max(initial=-1)) + 1
         number = int(self.split.max(initial=-1)) + 1
         self.area = np.bincount(self.component, area, self.count)

@@ -283,7 +283,8 @@ class RestShapes:
 
 def area_vectors(V: FloatArray, F: NDArray[np.integer]) -> FloatArray:
     """Return a normal (f, 3) of each triangle F (f, 3) between points V (n, 3); its length is twice the area."""
-    a, b, c = (V[corner] for corner in F.T)
+    # For rows, this is several times as fast as indexing.
+    a, b, c = (V.take(corner, axis=0) for corner in F.T)
     return np.cross(b - a, c - a)
 
 

@@ -47,7 +47,9 @@ from quasiharmonic.util.arrays import (
 Shares = dict[int, float]
 
 
-def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]:
+def fans(
+    F: IntArray, cut: BoolArray | None = None, pairs: tuple[IntArray, IntArray] | None = None
+) -> tuple[IntArray, IntArray]:
     """Split vertices at which triangles touch without a common edge.
 
     Parameters
@@ -56,6 +58,8 @@ def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]
         Any triangles.
     cut : (f, 3) bool, optional
         Sides, from each corner to the next, at which triangles are never joined.
+    pairs : two (p,) int64, optional
+        The sides that may be joined, as returned by `find_pairs`; by default all of these.
 
     Returns
     -------
@@ -68,7 +72,7 @@ def fans(F: IntArray, cut: BoolArray | None = None) -> tuple[IntArray, IntArray]
     corner = np.arange(F.size).reshape(-1, 3)
     tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
     ahead = corner[:, (1, 2, 0)].ravel()
-    one, other = find_pairs(F)
+    one, other = find_pairs(F) if pairs is None else pairs
     opposed = (tail[one] == head[other]) & (tail[one] != tail[other])
     if cut is not None:
         opposed &= ~(cut.ravel()[one] | cut.ravel()[other])

@@ -66,19 +66,19 @@ class EdgeGraph:
         normal = area_vectors(self.V, self.F)
         normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(np.float64).tiny)[:, None]
         # ``left`` is the triangle in which the edge runs from the smaller vertex to the larger, ``right`` the other.
-        rises = self.F.T[(1, 2, 0), :] > self.F.T
-        triangle = np.broadcast_to(np.arange(len(self.F)), self.side.shape)
-        left, right = np.zeros(len(self.ends), dtype=np.int64), np.zeros(len(self.ends), dtype=np.int64)
-        left[self.side[rises]], right[self.side[~rises]] = triangle[rises], triangle[~rises]
-        along = self.V[self.ends[:, 1]] - self.V[self.ends[:, 0]]
-        sine = (np.cross(normal[left], normal[right]) * along).sum(axis=1) / self.length
-        cosine = (normal[left] * normal[right]).sum(axis=1)
+        falls = self.F.T[(1, 2, 0), :] < self.F.T
+        around = np.zeros((2, len(self.ends)), dtype=np.int64)
+        around.ravel()[self.side + len(self.ends) * falls] = np.arange(len(self.F))
+        left, right = (normal.take(triangle, axis=0) for triangle in around)
+        along = self.V.take(self.ends[:, 1], axis=0) - self.V.take(self.ends[:, 0], axis=0)
+        sine = (np.cross(left, right) * along).sum(axis=1) / self.length
+        cosine = (left * right).sum(axis=1)
         return np.where(self.rim, 0, np.arctan2(sine, cosine))
 
     def mark_vertices(self, chosen: BoolArray) -> BoolArray:
         """Mask (n,) of the vertices that belong to any of the chosen edges (e,)."""
         found = np.zeros(self.n, dtype=bool)
-        found[self.ends[chosen]] = True
+        found[self.ends.compress(chosen, axis=0)] = True
         return found
 
     @cached_property
@@ -212,7 +212,7 @@ def edge_graph(V: FloatArray, F: IntArray, costs: FloatArray | None = None) -> E
     count = np.bincount(side.ravel())
     rim = count == 1
 
-    along = space[ends[:, 1]] - space[ends[:, 0]]
+    along = space.take(ends[:, 1], axis=0) - space.take(ends[:, 0], axis=0)
     length = np.linalg.norm(along, axis=1)
     # Lengths must be positive, because zeros are not edges in a sparse graph.
     length = np.maximum(length, max(1e-12 * float(length.mean()), np.finfo(np.float64).tiny))

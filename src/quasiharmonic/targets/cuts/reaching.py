@@ -26,7 +26,7 @@ from quasiharmonic.targets.cuts.shortening import shorten_cuts, stretches
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
-_ROUNDS = 3
+_ROUNDS = 2
 # Lower bound of angles in radians, so that cotangents of slivers stay finite.
 _LEAST_ANGLE = 1e-3
 
@@ -103,6 +103,7 @@ class _Balance:
         """Extend cuts to the vertices with the largest scale, while that lowers the price."""
         w = self._weigh(cut)
         given_up = np.zeros(self.graph.n, dtype=bool)
+        distance, before = self._reach(cut)
         failures = 0
         while failures < self._MAX_FAILURES:
             height = np.where(given_up, 0.0, np.abs(w))
@@ -110,18 +111,22 @@ class _Balance:
                 break
             # The first of the vertices that are equal up to rounding.
             tip = int(np.argmax(height >= (1 - self._TIES) * height.max()))
-            opened = np.flatnonzero(self._rim | self.graph.mark_vertices(cut))
-            distance, before = self.graph.distances(opened, self.graph.cost)
             longer = cut.copy()
             longer[self.graph.way_back(before, tip)] = True
             w_then = self._weigh(longer)
             if self.price(longer) < self.price(cut):
                 cut, w, failures = longer, w_then, 0
+                distance, before = self._reach(cut)
             else:
                 around, _ = self.graph.distances(np.array([tip]), self.graph.cost, limit=self._NEAR * distance[tip])
                 given_up |= np.isfinite(around)
                 failures += 1
         return cut
+
+    def _reach(self, cut: BoolArray) -> tuple[FloatArray, IntArray]:
+        """Cost of the cheapest path to each vertex from the boundary or a cut, and its predecessor on the path."""
+        opened = np.flatnonzero(self._rim | self.graph.mark_vertices(cut))
+        return self.graph.distances(opened, self.graph.cost)
 
     def prune(self, cut: BoolArray) -> BoolArray:
         """Remove stretches to loose ends that raise the price, shortest first."""

@@ -62,27 +62,32 @@ def shorten_cuts(
     lowest = np.inf if price is None else price(cut)
     cut = cut.copy()
     degree = np.bincount(graph.ends[cut].ravel(), minlength=graph.n)
-    optimal = set[bytes]()
+    # The number of exchanges before the last try of each stretch that has not been exchanged.
+    tried = dict[bytes, int]()
+    exchanges = 0
     for _ in range(_ROUNDS):
-        changed = False
+        before = exchanges
         # Costliest first.
         for way in sorted(stretches(graph, cut), key=lambda way: (-graph.cost[way].sum(), way[0])):
             heartbeat()
-            if way.tobytes() in optimal or not _is_stretch(graph, cut, degree, way):
+            name = way.tobytes()
+            # Other cuts far away do not matter.
+            done = name in tried and (rings is not None or tried[name] == exchanges)
+            if done or not _is_stretch(graph, cut, degree, way):
                 continue
             instead = _find_cheapest_path(graph, cut, way) if rings is None else _cheapest_near(graph, cut, way, rings)
             if instead is None:
-                if rings is not None:
-                    optimal.add(way.tobytes())
+                tried[name] = exchanges
                 continue
             exchanged = _exchange(graph, cut, way, instead)
             if price is not None:
                 if not (now := price(exchanged)) < lowest:
+                    tried[name] = exchanges
                     continue
                 lowest = now
-            cut, changed = exchanged, True
+            cut, exchanges = exchanged, exchanges + 1
             degree = np.bincount(graph.ends[cut].ravel(), minlength=graph.n)
-        if not changed:
+        if exchanges == before:
             break
     return cut
 
@@ -187,8 +192,8 @@ def _find_path_across(
 
 def _corner_at(graph: EdgeGraph, edge: int, end: int) -> int:
     """A corner at one end of an edge, in a triangle that has this edge; numbered as in `find_path_across`."""
-    k, t = np.argwhere(graph.side == edge)[0]
-    return int(3 * t + (k if graph.F[t, k] == end else (k + 1) % 3))
+    half = int(np.argmax(graph.half_edges[1] == edge))
+    return half if graph.F.flat[half] == end else half + 1 - 3 * (half % 3 == 2)
 
 
 def find_path_across(

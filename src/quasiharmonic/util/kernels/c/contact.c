@@ -162,6 +162,18 @@ static int64_t count_overlap(const Board *board, const Bitmap *bitmap, int64_t r
     return sum;
 }
 
+/* The number of a bitmap's runs that have an occupied cell beside them, after the end or before the first cell. */
+static int64_t count_beside(const Board *board, const Bitmap *bitmap, int64_t row, int64_t column, int after)
+{
+    int64_t sum = 0;
+    for (int64_t k = 0; k < bitmap->count; k++) {
+        const Run *run = bitmap->runs + k;
+        const int64_t cell = column + (after ? run->end : run->first - 1);
+        sum += (int64_t)(row_of(board, 0, row + run->row)[cell / 64] >> cell % 64 & 1);
+    }
+    return sum;
+}
+
 /* Find the free place with the most contact, at least one cell away from the sides; its contact, or -1 if it is not
  * more than `least`. `three` has room for the collisions of three rows. */
 static int64_t find_place(const Board *board, const Bitmap *bitmap, int64_t least, uint64_t *three, int64_t *place)
@@ -188,21 +200,20 @@ static int64_t find_place(const Board *board, const Bitmap *bitmap, int64_t leas
             for (int64_t j = 64 * w; bits; bits >>= 1, j++) {
                 if (!(bits & 1))
                     continue;
-                /* Shifts by one cell that are not free, and the most contact that each has. */
-                const struct {
-                    int64_t row, column, most;
-                } shifts[] = {
-                    {i + 1, j, (above[w] >> j % 64 & 1) ? rise : 0},
-                    {i - 1, j, (below[w] >> j % 64 & 1) ? rise : 0},
-                    {i, j + 1, (right >> j % 64 & 1) ? side : 0},
-                    {i, j - 1, (left >> j % 64 & 1) ? side : 0},
-                };
+                /* Shifts by one cell that are not free; each one has at most this contact. */
+                const int shifts[] = {right >> j % 64 & 1, left >> j % 64 & 1, above[w] >> j % 64 & 1,
+                                      below[w] >> j % 64 & 1};
+                const int64_t most[] = {side, side, rise, rise};
                 int64_t contact = 0;
                 for (int k = 0; k < 4; k++)
-                    contact += shifts[k].most;
-                for (int k = 0; k < 4 && contact > best; k++)
-                    if (shifts[k].most > 0)
-                        contact += count_overlap(board, bitmap, shifts[k].row, shifts[k].column) - shifts[k].most;
+                    contact += shifts[k] ? most[k] : 0;
+                for (int k = 0; k < 4 && contact > best; k++) {
+                    if (!shifts[k])
+                        continue;
+                    contact -= most[k];
+                    contact += k < 2 ? count_beside(board, bitmap, i, j, k == 0)
+                                     : count_overlap(board, bitmap, i + (k == 2 ? 1 : -1), j);
+                }
                 if (contact > best) {
                     best = contact;
                     place[0] = i;
