@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quasiharmonic import Problem, certify
+from quasiharmonic import Problem, Status, certify, injective_map
 from quasiharmonic.geometry.mesh.splitting import split_edges
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components, edges
 from quasiharmonic.solver.construction.constructing import construct_and_thin, is_simple
@@ -408,3 +408,13 @@ def test_shapes_have_the_exact_sign():
     middle = complex(1 + 500 * step, 1 + 500 * step)
     assert quality(p, q, middle) == 0
     assert quality(p, q, middle + 1j * step) > 0 > quality(p, q, middle - 1j * step)
+
+
+def test_loops_beside_each_other_are_not_simple():
+    V, F = disk(4)
+    F = F[1:]
+    outer, inner = sorted(boundary_loops(F, len(V)), key=len, reverse=True)
+    beside = np.concatenate([V[outer], V[inner] * [-1, 1] + [3, 0]])
+    problem = Problem(V, F, np.concatenate([outer, inner]), beside)
+    assert not is_simple(problem)
+    assert injective_map(problem.V, F, problem.fixed, beside, refine=True).status is Status.IMPOSSIBLE

@@ -287,6 +287,7 @@ class TestBeyondRepair:
         result = repair(V, F, V * [-1, 1])
         assert not result.injective
         assert [o.kind.name for o in result.islands[0].diagnosis.obstructions] == ["REVERSED"]
+        assert repair(V, F, V * [-1, 1], unmirror=True).injective
 
     def test_closed_surface(self):
         F = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])

@@ -71,6 +71,9 @@ def test_objects_and_other_files_are_no_arrays(tmp_path):
     (tmp_path / "b.npy").write_bytes(b"")
     with pytest.raises(ValueError, match="magic"):
         read_npy(tmp_path / "b.npy")
+    (tmp_path / "c.npy").write_bytes(b"\x93NUMPY\x01\x00\x16\x00{'descr': '<f8', 'shap\n" + bytes(400))
+    with pytest.raises(ValueError, match="EOF in multi-line"):
+        read_npy(tmp_path / "c.npy")
 
 
 @pytest.mark.parametrize("data", [NESTED, b"{", b"\xff"])

@@ -229,3 +229,25 @@ def test_the_search_returns_charts_that_keep_away_from_themselves():
         # Rounded to a millionth of the chart's size, the boundary still does not touch itself.
         unit = 2.0**-20 * np.sqrt(len(chart.F) / 32)
         assert certify(chart.F, np.rint(chart.uv / unit) * unit).bijective
+
+
+def test_long_charts_that_look_alike_in_large_cells_are_placed():
+    rng = np.random.default_rng(0)
+    blades = []
+    for _ in range(120):
+        width, height, angle = 0.01 * rng.uniform(0.7, 1.3), rng.uniform(0.6, 1.2), rng.uniform(0, 2 * np.pi)
+        across, up = width * np.array([np.cos(angle), np.sin(angle), 0]), np.array([0, 0, height])
+        root = np.array([*rng.uniform(0, 5, 2), 0])
+        blades.append(root + np.array([-across, across, up + across / 2, up - across / 2]))
+    F = (np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(blades))[:, None, None]).reshape(-1, 3)
+    result = unwrap(np.concatenate(blades), F, resolution=512)
+    assert result.certificate.bijective
+    assert result.n_charts == len(blades)
+
+
+@pytest.mark.parametrize("height", [1e30, 1e38, -6e21])
+def test_a_vertex_without_data(height):
+    V, F = disk(3)
+    V = np.pad(V, [(0, 0), (0, 1)])
+    V[-1, 2] = height
+    assert unwrap(V, F).certificate.bijective

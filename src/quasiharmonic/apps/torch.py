@@ -17,7 +17,6 @@ from quasiharmonic.util.hints import explain_missing
 
 with explain_missing("quasiharmonic.torch needs PyTorch", extra="torch"):
     import torch
-    from torch.autograd.function import once_differentiable
 
 from quasiharmonic.apps.gradients.derivative import Derivative
 from quasiharmonic.apps.gradients.layers import (
@@ -75,9 +74,11 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
         ctx.set_materialize_grads(False)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, cotangent: torch.Tensor | None, _: None) -> tuple[torch.Tensor | None, ...]:
-        """Gradients with respect to the arguments that need them."""
+        """Gradients with respect to the arguments that need them; RuntimeError if they are to be differentiated."""
+        # `once_differentiable` would raise later, and not at all if its node is not needed for the argument.
+        if torch.is_grad_enabled():
+            raise RuntimeError("maps have first derivatives only: omit create_graph=True, or detach the map")
         if cotangent is None:
             return (None,) * (2 + len(ctx.names))
         needed = [name for name, needs in zip(ctx.names, ctx.needs_input_grad[2:], strict=True) if needs]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas import atlas_verdict
-from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict, IslandReport, mirrored_islands
+from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict, IslandReport, is_mirrored, mirrored_islands
 from quasiharmonic.apps.island_repair import IslandRepair
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.io.accepts_mesh import accepts_mesh
@@ -284,9 +284,11 @@ def repair(
     checked = RepairOptions(**options)
     mesh = SeamedMesh(V, F, FT, uv)
     fixed = vertex_indices("fixed", () if checked.fixed is None else checked.fixed, len(mesh.V))
+    # A single mirrored island is called inverted, unless it is to be reflected.
+    mirrored = [is_mirrored(one.F, one.uv) for one in mesh.islands] if checked.unmirror else mirrored_islands(mesh)
     done = [
-        _report_mirrored(island, checked.unmirror) if mirrored else _repair_island(mesh.V, island, fixed, checked)
-        for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True)
+        _report_mirrored(island, checked.unmirror) if turned else _repair_island(mesh.V, island, fixed, checked)
+        for island, turned in zip(mesh.islands, mirrored, strict=True)
     ]
     repaired = mesh.with_places([new for new, _ in done])
     assert repaired.uv is not None

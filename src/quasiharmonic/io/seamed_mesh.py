@@ -15,8 +15,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
 from quasiharmonic.geometry.mesh.splitting import fans, find_representatives, number_fans, renumber
-from quasiharmonic.geometry.mesh.topology import edge_keys, group_by_label, pair_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_pairs, group_by_label, pair_keys
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -28,11 +29,16 @@ from quasiharmonic.util.arrays import (
     count_of,
     edge_names,
     index_array,
+    list_others,
     map_array,
+    to_complex,
     triangle_names,
     triangle_rows,
     vertex_array,
 )
+
+# The apexes of stacked triangles are at most this fraction of their shortest side apart.
+_SAME = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +77,33 @@ class Island:
     vertices: IntArray
     V: FloatArray
     uv: FloatArray
+
+
+def find_folds(one: IntArray, other: IntArray, corner_uv: FloatArray) -> IntArray:
+    """Find edges at which a triangle meets its mirror image, stacked on it.
+
+    A part that is folded exactly onto itself, at a plane of symmetry, is a part and its mirror image.
+
+    Parameters
+    ----------
+    one, other : (p,) int64
+        The two sides of each edge, as returned by `find_pairs`.
+    corner_uv : (f, 3, 2) float64
+        Positions of the corners.
+
+    Returns
+    -------
+    (k,) int64
+        Ascending indices of the edges whose triangles have almost the same three positions, in opposite order.
+    """
+    z = to_complex(corner_uv.reshape(-1, 2))
+    start, end, apex = (z[one - one % 3 + (one + step) % 3] for step in range(3))
+    with np.errstate(invalid="ignore", over="ignore"):
+        shortest = np.minimum(np.abs(end - start), np.minimum(np.abs(apex - start), np.abs(apex - end)))
+        near = np.flatnonzero(np.abs(apex - z[other - other % 3 + (other + 2) % 3]) <= _SAME * shortest)
+    first, second = (orientation_or_nonfinite(*corner_uv[side[near] // 3].swapaxes(0, 1))[0] for side in (one, other))
+    folds: IntArray = near[first * second < 0]
+    return folds
 
 
 def which_island(triangles: IntArray) -> str:
@@ -136,7 +169,10 @@ class SeamedMesh:
 
     @cached_property
     def _welded(self) -> IntArray:
-        """Number of the (vertex, position) pair at every corner of the mapped triangles, from 0; (g, 3) int64."""
+        """Number of the (vertex, position) pair at every corner of the mapped triangles, from 0; (g, 3) int64.
+
+        At folds, corners of the two triangles have different numbers.
+        """
         if self.uv is None:
             place: IntArray = np.arange(int(self.FT.max(initial=-1)) + 1)
         else:
@@ -145,7 +181,15 @@ class SeamedMesh:
                 pairs = np.ascontiguousarray(self.uv + 0.0).view(np.complex128).ravel()
             place = np.unique(pairs, return_inverse=True)[1].ravel()
         corners = self.F[self.mapped] * max(len(place), 1) + place[self.FT[self.mapped]]
-        return np.unique(corners, return_inverse=True)[1].reshape(-1, 3)
+        welded = np.unique(corners, return_inverse=True)[1].reshape(-1, 3)
+        if self.uv is None:
+            return welded
+        one, other = find_pairs(welded)
+        folds = find_folds(one, other, self.uv.take(self.FT[self.mapped], axis=0))
+        if not folds.size:
+            return welded
+        joined = list_others(len(one), folds)
+        return fans(welded, pairs=(one[joined], other[joined]))[0]
 
     @cached_property
     def mapped(self) -> IntArray:
@@ -163,7 +207,8 @@ class SeamedMesh:
     def islands(self) -> tuple[Island, ...]:
         """The parts into which the seams cut the surface, ordered by their first triangle.
 
-        Edges of three or more triangles, or of two triangles with opposite orientation, count as seams.
+        Edges of three or more triangles, or of two triangles with opposite orientation, count as seams. So do edges of
+        a triangle and its mirror image that is stacked on it.
         """
         places = np.full((int(self.FT.max(initial=-1)) + 1, 2), np.nan) if self.uv is None else self.uv
         split, island = fans(self._welded)

@@ -17,6 +17,7 @@ from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 from urllib.parse import unquote
 
@@ -105,7 +106,7 @@ def read_npy(path: str | os.PathLike[str]) -> NDArray[Any]:
             version = np.lib.format.read_magic(file)
             read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             shape, _, dtype = read(file)
-        except (ValueError, EOFError, RecursionError, MemoryError) as error:
+        except (ValueError, EOFError, RecursionError, MemoryError, TokenError) as error:
             # The first line names the error; further lines address programmers.
             raise ValueError(str(error).partition("\n")[0]) from error
         size = dtype.itemsize

@@ -342,8 +342,9 @@ class Flattening:
         """Scale a map to the surface's area; if this inverts a triangle, scale exactly by a power of two."""
         unit = scale_to_unit(uv)
         centred = unit - unit.mean(axis=0)
-        area = float(signed_areas(self._piece.F, in_units(centred, 0)).sum())
-        factor = np.sqrt(self._piece.area / area)
+        area = float(signed_areas(self._piece.F, in_units(unit, 0)).sum())
+        # The area of needles can be lost by rounding.
+        factor = np.sqrt(self._piece.area / area) if area > 0 else 1.0
         scaled = centred * factor
         return scaled if is_injective(self._piece.F, scaled) else np.ldexp(unit, round(np.log2(factor)))
 

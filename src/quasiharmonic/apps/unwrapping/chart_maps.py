@@ -223,6 +223,7 @@ def _initial_map(piece: Piece) -> FloatArray | None:
     return None
 
 
+@np.errstate(all="ignore")
 def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> None:
     """Lower an energy of the chart's map, which stays injective."""
     assert chart.uv is not None
@@ -259,6 +260,7 @@ def _relax_long(chart: WorkingChart, bound: float) -> None:
 def _fit_scale(piece: Piece, uv: FloatArray) -> FloatArray:
     """Scale a map to the surface's area; if this inverts a triangle, scale exactly by a power of two."""
     area = float(signed_areas(piece.F, in_units(uv, 0)).sum())
-    factor = np.sqrt(piece.area / area)
+    # The area of needles can be lost by rounding.
+    factor = np.sqrt(piece.area / area) if area > 0 else 1.0
     scaled = (uv - uv.mean(axis=0)) * factor
     return scaled if is_injective(piece.F, scaled) else np.ldexp(uv, round(np.log2(factor)))

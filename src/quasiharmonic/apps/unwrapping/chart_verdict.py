@@ -270,7 +270,8 @@ def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tupl
     spots = np.unique(V + 0.0, axis=0, return_inverse=True)[1].reshape(-1)[F]
     places, inverse = np.unique(corner_uv.reshape(-1, 2) + 0.0, axis=0, return_inverse=True)
     place = inverse.reshape(F.shape)
-    both = spots * len(places) + place
+    pairs, inverse = np.unique(spots * len(places) + place, return_inverse=True)
+    both = inverse.reshape(F.shape)
     left = _find_copies(cleaned, both, place, len(places))
     rows = np.flatnonzero(~left)
     keys, first, corners = np.unique(both[rows], return_index=True, return_inverse=True)
@@ -279,7 +280,7 @@ def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tupl
     preferred[cleaned.triangles] = np.where(cleaned.flipped, -1, 1)
     turned = _orient(G, len(keys), preferred[rows])
     G[turned] = G[turned][:, (0, 2, 1)]
-    points, uv = V[F[rows].ravel()[first]], places[keys % len(places)]
+    points, uv = V[F[rows].ravel()[first]], places[pairs[keys] % len(places)]
     verdict = certify(SeamedMesh(points, G, G, uv))
     # A texture is mirrored if `unwrap` treated an inside-out model as turned outward.
     inward = len(verdict.islands) == 1 and not verdict.injective and bool((cleaned.facing < 0).all())

@@ -18,7 +18,15 @@ from quasiharmonic.apps.unwrapping.pieces import find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, find_mirror
 from quasiharmonic.geometry.mesh.reference import area_vectors
 from quasiharmonic.geometry.mesh.splitting import fans
-from quasiharmonic.geometry.mesh.topology import are_sides, edge_keys, label_components, mark_sides, pair_keys
+from quasiharmonic.geometry.mesh.topology import (
+    are_sides,
+    edge_keys,
+    find_pairs,
+    label_components,
+    mark_sides,
+    pair_keys,
+)
+from quasiharmonic.io.seamed_mesh import find_folds
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -181,11 +189,13 @@ def _turn_corners(corner_uv: FloatArray, cleaned: CleanedMesh) -> FloatArray:
 
 
 def _find_uv_cuts(corner_uv: FloatArray, cleaned: CleanedMesh) -> IntArray:
-    """Return the edges (k, 2) of the cleaned mesh at which texture coordinates (f', 3, 2) differ."""
+    """Return the edges (k, 2) of the cleaned mesh at which texture coordinates (f', 3, 2) differ or fold."""
     # Corners without coordinates count as one position.
     position = np.nan_to_num(corner_uv, nan=np.finfo(np.float64).max) + 0.0
     rows = np.unique(position.reshape(-1, 2), axis=0, return_inverse=True)[1]
     side = find_differing_sides(cleaned.F, rows.reshape(-1, 3), len(cleaned.V))
+    one, other = find_pairs(cleaned.F)
+    side = np.union1d(side, one[find_folds(one, other, corner_uv)])
     return np.stack([cleaned.F.ravel()[side], cleaned.F[:, (1, 2, 0)].ravel()[side]], axis=1)
 
 

@@ -35,6 +35,8 @@ class Bitmaps:
 
     Attributes
     ----------
+    kept : list of int
+        Their numbers among all bitmaps.
     directions : (k,) complex128
         Unit vectors that become the x-axis.
     cells : list of (h, w) bool
@@ -46,8 +48,8 @@ class Bitmaps:
 
     def __init__(self, directions: ComplexArray, cells: list[BoolArray]) -> None:
         first = {(bitmap.shape, bitmap.tobytes()): k for k, bitmap in reversed(list(enumerate(cells)))}
-        kept = sorted(first.values())
-        self.directions, self.cells = directions[kept], [cells[k] for k in kept]
+        self.kept = sorted(first.values())
+        self.directions, self.cells = directions[self.kept], [cells[k] for k in self.kept]
         self.runs = list_runs(self.cells)
         self.side = max(max(bitmap.shape) for bitmap in cells)
         self.count = min(int(bitmap.sum()) for bitmap in cells)
@@ -113,8 +115,10 @@ class Board:
         # Rows first: this is several times as fast as both axes at once.
         pooled = np.asarray(padded.reshape(h, step, w * step).any(axis=1).reshape(h, w, step).any(axis=2))
         coarse._cells[1 : 1 + coarse.rows, 1 : 1 + coarse.columns] = pooled[: coarse.rows, : coarse.columns]
-        found = coarse.find(Bitmaps(bitmaps.directions, [_enlarge_cells(bitmap, step) for bitmap in bitmaps.cells]))
-        return None if found is None else Spot(found.direction, found.row * step, found.column * step)
+        larger = Bitmaps(bitmaps.directions, [_enlarge_cells(bitmap, step) for bitmap in bitmaps.cells])
+        found = coarse.find(larger)
+        # Different bitmaps can be equal in larger cells.
+        return None if found is None else Spot(larger.kept[found.direction], found.row * step, found.column * step)
 
 
 def _enlarge_cells(bitmap: BoolArray, step: int) -> BoolArray:
