@@ -76,13 +76,14 @@ class _Map(torch.autograd.Function):  # type: ignore[misc]
     @staticmethod
     def backward(ctx: Any, cotangent: torch.Tensor | None, _: None) -> tuple[torch.Tensor | None, ...]:
         """Gradients with respect to the arguments that need them; RuntimeError if they are to be differentiated."""
+        if cotangent is None:
+            return (None,) * (2 + len(ctx.names))
+        values = _numpy(cotangent)
         # `once_differentiable` would raise later, and not at all if its node is not needed for the argument.
         if torch.is_grad_enabled():
             raise RuntimeError("maps have first derivatives only: omit create_graph=True, or detach the map")
-        if cotangent is None:
-            return (None,) * (2 + len(ctx.names))
         needed = [name for name, needs in zip(ctx.names, ctx.needs_input_grad[2:], strict=True) if needs]
-        found = compute_gradients(ctx.layer, ctx.derivatives, _numpy(cotangent), needed)
+        found = compute_gradients(ctx.layer, ctx.derivatives, values, needed)
         return (
             None,
             None,
