@@ -183,7 +183,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
         chart.use(uv)
         if chart.start is not None:
             _relax_long(chart, bound)
-        if flat is None and not (chart.start is not None and keeps_bound(chart, bound)):
+        if flat is None and (chart.start is None or chart.too_long.any()):
             _descend(chart, SymmetricDirichlet(), check_wanted)
             _relax_long(chart, bound)
         if keeps_bound(chart, bound):

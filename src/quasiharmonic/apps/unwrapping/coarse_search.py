@@ -24,9 +24,10 @@ from quasiharmonic.apps.flattening.worst_triangles import mark_around
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.geometry.coarsening import Removal, has_marked_corner
+from quasiharmonic.geometry.coarsening import Removal, has_marked_corner, mark_rings
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
+from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.splitting import split_parts
 from quasiharmonic.geometry.mesh.topology import find_pairs
@@ -47,7 +48,9 @@ _PERMITTED = 0.5
 # A triangle whose singular values have a smaller ratio gets a new rotation.
 _LEAST_RATIO = 0.15
 # Maps with a larger share of inverted triangles are not repaired.
-_FEW = 0.01
+_FEW = 0.05
+# Rings of triangles around inverted ones that are mapped anew, first and later.
+_RINGS = 2, 6
 # Maps with more crossings of their boundary than this share of its edges are not used.
 _FEW_CROSSINGS = 0.01
 # A coarse mesh with a larger share of the vertices is cut without a coarser one.
@@ -165,7 +168,7 @@ def _fit(
         with np.errstate(all="ignore"):
             scale = np.sqrt(area.sum() / (area * larger * smaller).sum())
         good = (larger * scale < bound) & (smaller * scale * bound > 1)
-        if k == _MOST_FITS or (k >= _LEAST_FITS and area[~good].sum() <= FREE_SHARE * area.sum()):
+        if k == _MOST_FITS or (k >= _LEAST_FITS and area[~good].sum() <= 0.5 * FREE_SHARE * area.sum()):
             break
         # At first the targets are rotations, then the nearest matrices with little stretch.
         less = 1.0 if k < _ROTATED_FITS else most
@@ -186,7 +189,7 @@ def _fit(
     rim = sum(map(len, chart.piece.loops))
     if len(check_loops(chart.piece.loops, to_points(w))[0]) > _FEW_CROSSINGS * rim:
         return None
-    return _repair(chart, to_points(w), smaller <= 0)
+    return _repair(chart, to_points(w))
 
 
 def _derivatives(g: ComplexArray, at: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
@@ -199,27 +202,33 @@ def _direction(p: ComplexArray) -> ComplexArray:
     return p / np.maximum(np.abs(p), np.finfo(np.float64).tiny)
 
 
-def _repair(chart: WorkingChart, uv: FloatArray, inverted: BoolArray) -> FloatArray | None:
-    """Map the surroundings of inverted triangles (f,) anew, with all other vertices fixed; None if that fails."""
-    if is_injective(chart.F, uv):
-        return uv
-    if np.count_nonzero(inverted) > _FEW * len(chart.F):
-        return None
-    n = len(uv)
-    loose = mark_around(chart.F, inverted, n) & ~mark(n, *chart.piece.loops)
-    rows = np.flatnonzero(has_marked_corner(chart.F, loose))
-    if not rows.size:
-        return None
-    # Few surfaces need this, and it imports the whole solver.
-    from quasiharmonic.solver.mapping import injective_map
+def _repair(chart: WorkingChart, uv: FloatArray) -> FloatArray | None:
+    """Map the surroundings of inverted triangles anew, with all other vertices fixed; None if that fails.
 
-    for _, T, vertices in split_parts(chart.F[rows], rows, _NO_CUT, n):
-        fixed = np.flatnonzero(~loose[vertices])
-        try:
-            uv[vertices] = injective_map(chart.V[vertices], T, fixed, uv[vertices[fixed]]).uv
-        except ValueError:
-            # The surroundings are no disks.
+    If the surroundings have no map, larger ones are mapped.
+    """
+    n = len(uv)
+    rim = mark(n, *chart.piece.loops)
+    for rings in _RINGS:
+        if is_injective(chart.F, uv):
+            return uv
+        inverted = triangle_signs(chart.F, uv)[0] <= 0
+        if np.count_nonzero(inverted) > _FEW * len(chart.F):
             return None
+        loose = mark_rings(chart.F, mark(n, chart.F[inverted]), rings) & ~rim
+        rows = np.flatnonzero(has_marked_corner(chart.F, loose))
+        if not rows.size:
+            return None
+        # Few surfaces need this, and it imports the whole solver.
+        from quasiharmonic.solver.mapping import injective_map
+
+        for _, T, vertices in split_parts(chart.F[rows], rows, _NO_CUT, n):
+            fixed = np.flatnonzero(~loose[vertices])
+            try:
+                uv[vertices] = injective_map(chart.V[vertices], T, fixed, uv[vertices[fixed]]).uv
+            except ValueError:
+                # The surroundings are no disks.
+                return None
     return uv if is_injective(chart.F, uv) else None
 
 

@@ -29,8 +29,8 @@ _STEPS = 2
 _TOLERANCE = 1e-2
 # The search stops after this number of successive updates without fewer crossings.
 _MAX_STALLS = 4
-# In larger charts, only so many vertices move, those closest to overlaps.
-_MAX_FREE = 5_000
+# In larger charts, only so many vertices move, those closest to overlaps: a number and as many for each crossing.
+_FREE, _FREE_BY_CROSSING = 1_000, 200
 
 
 class Penetrations:
@@ -124,10 +124,11 @@ def separate(chart: WorkingChart, bound: float, check_wanted: Callable[[], objec
 def _find_far_vertices(chart: WorkingChart) -> IntArray:
     """Vertices that stay where they are: at least one, and in a large chart all that are far from its overlaps."""
     assert chart.uv is not None
-    if len(chart.uv) <= _MAX_FREE:
+    count = _FREE + _FREE_BY_CROSSING * len(chart.crossings)
+    if len(chart.uv) <= count:
         return np.array([int(chart.piece.loops[0][0])])
     distance, _ = KDTree(chart.uv[np.unique(chart.crossings)]).query(chart.uv)
-    return np.sort(np.argsort(distance, kind="stable")[_MAX_FREE:])
+    return np.sort(np.argsort(distance, kind="stable")[count:])
 
 
 def overlapping_share(chart: WorkingChart) -> float:
