@@ -86,6 +86,12 @@ def test_coordinates_that_overlap_themselves_are_replaced():
 
 
 @pytest.mark.slow
+def test_unknown_coordinates_are_none():
+    V, F = starfish(3, 8)
+    result, plain = unwrap(V, F, uv=np.full((len(V), 2), np.nan)), unwrap(V, F)
+    assert np.array_equal(result.uvs, plain.uvs)
+
+
 def test_closed_parts_without_coordinates_are_cut():
     V, F, uv = strip()
     more, triangles = torus(12, 6)

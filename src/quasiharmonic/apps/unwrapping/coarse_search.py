@@ -41,6 +41,8 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 _ROTATED_FITS = 4
 # Least number of all fits, after which the search stops when the bound is kept.
 _LEAST_FITS = 6
+# The bound counts as kept if at most this part of the free share exceeds it: repairs may stretch a little more.
+_ENOUGH = 0.5
 # Largest number of all fits.
 _MOST_FITS = 16
 # A later fit permits this share of the stretch that the bound permits.
@@ -168,7 +170,7 @@ def _fit(
         with np.errstate(all="ignore"):
             scale = np.sqrt(area.sum() / (area * larger * smaller).sum())
         good = (larger * scale < bound) & (smaller * scale * bound > 1)
-        if k == _MOST_FITS or (k >= _LEAST_FITS and area[~good].sum() <= 0.5 * FREE_SHARE * area.sum()):
+        if k == _MOST_FITS or (k >= _LEAST_FITS and area[~good].sum() <= _ENOUGH * FREE_SHARE * area.sum()):
             break
         # At first the targets are rotations, then the nearest matrices with little stretch.
         less = 1.0 if k < _ROTATED_FITS else most

@@ -29,8 +29,9 @@ _STEPS = 2
 _TOLERANCE = 1e-2
 # The search stops after this number of successive updates without fewer crossings.
 _MAX_STALLS = 4
-# In larger charts, only so many vertices move, those closest to overlaps: a number and as many for each crossing.
-_FREE, _FREE_BY_CROSSING = 1_000, 200
+# In larger charts, only some vertices move: those at most twice as far from a crossing as crossings are from each other,
+# but at least and at most so many.
+_FEWEST_FREE, _MOST_FREE = 1_000, 5_000
 
 
 class Penetrations:
@@ -124,11 +125,13 @@ def separate(chart: WorkingChart, bound: float, check_wanted: Callable[[], objec
 def _find_far_vertices(chart: WorkingChart) -> IntArray:
     """Vertices that stay where they are: at least one, and in a large chart all that are far from its overlaps."""
     assert chart.uv is not None
-    count = _FREE + _FREE_BY_CROSSING * len(chart.crossings)
-    if len(chart.uv) <= count:
+    if len(chart.uv) <= _FEWEST_FREE:
         return np.array([int(chart.piece.loops[0][0])])
-    distance, _ = KDTree(chart.uv[np.unique(chart.crossings)]).query(chart.uv)
-    return np.sort(np.argsort(distance, kind="stable")[count:])
+    crossed = chart.uv[np.unique(chart.crossings)]
+    distance, _ = KDTree(crossed).query(chart.uv)
+    near = np.count_nonzero(distance <= 2 * np.linalg.norm(np.ptp(crossed, axis=0)))
+    order = np.argsort(distance, kind="stable")
+    return np.sort(order[min(max(near, _FEWEST_FREE), _MOST_FREE, len(order) - 1) :])
 
 
 def overlapping_share(chart: WorkingChart) -> float:

@@ -116,8 +116,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         3, except triangles with an angle below 1°. Lower values need more seams. `UnwrapResult.misses` lists the charts
         that exceed the bound.
     max_charts : int, optional
-        Maximum number of charts. It is exceeded only by connected parts, and by parts that have no bijective map
-        otherwise.
+        Maximum number of charts. It is exceeded only by connected parts, by parts between seams that you demand, and by
+        parts that have no bijective map otherwise.
     resolution : int or (int, int)
         Side of the texture in texels, or width and height.
     padding : float
@@ -125,7 +125,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     texels_per_unit : float, optional
         Texels per unit of length of the model. Default: the largest value at which all charts fit.
     tiles : int
-        Number of tiles (UDIM). Tile k is the unit square whose lower left corner is ``(k % 10, k // 10)``.
+        Number of tiles (UDIM). Tile k is the unit square whose lower left corner is ``(k % 10, k // 10)``. Charts too
+        long for a tile are divided, so more tiles give more charts.
     tile_by : (f,) array of int or "material", optional
         The triangles with the same number get a tile of their own, in ascending order of the numbers, all tiles at one
         density. With ``"material"``, the numbers are those of the materials of a file, a `MeshData`, or of the meshes
@@ -247,6 +248,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         wanted.resolution, wanted.padding, wanted.texels_per_unit, wanted.tiles, wanted.rotate, bool(wanted.stack)
     )
     corner_uv = None if wanted.uv is None else _corner_positions(wanted.uv, F, len(V))
+    if corner_uv is not None and np.isnan(corner_uv).all():
+        corner_uv = None
     costs = None if wanted.edge_costs is None else side_costs(wanted.edge_costs, len(F))
 
     def report(phase: str, done: int = 0, total: int = 1) -> None:
