@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from quasiharmonic import boundary_loops, distortion, io, polish
 from quasiharmonic.surfaces import disk
+from quasiharmonic.util.progress import end_work
 from shared.commands import run, write_input
 from shared.solvable_problems import star_problem
 
@@ -47,6 +50,31 @@ class TestPolish:
         with pytest.raises(SystemExit):
             run("map", star, "-o", tmp_path / "o.obj", "--polish", "mips", "--no-polish")
         assert "not allowed" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        ("stop", "status", "message"),
+        [
+            (lambda step: end_work(), "time_limit", "The time limit ended the work."),
+            (Mock(side_effect=KeyboardInterrupt), "interrupted", "Interrupted. This is the best map so far"),
+        ],
+        ids=["time limit", "Ctrl-C"],
+    )
+    def test_the_few_steps_end_early(self, star, tmp_path, monkeypatch, capsys, stop, status, message):
+        """The time limit is also that of the polish, and the text report says why the work ended."""
+        callbacks = iter([None, stop])
+
+        @contextmanager
+        def progress_line():
+            yield next(callbacks)
+
+        monkeypatch.setattr("quasiharmonic.ui.cli.process.progress_line", progress_line)
+        out, report = tmp_path / "o.obj", tmp_path / "r.json"
+        assert run("map", star, "-o", out, "--time-limit", 60, "--json", report) == 0
+        assert next(callbacks, "none left") == "none left"
+        facts = json.loads(report.read_text())
+        assert (facts["status"], facts["injective"]) == (status, True)
+        assert message in capsys.readouterr().out
+        assert run("check", out) == 0
 
     @pytest.mark.slow
     def test_lowers_distortion_and_stays_certified(self, star, tmp_path, capsys):

@@ -149,7 +149,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
             facts["pattern"] = str(options.pattern)
             write_pattern(options.pattern, *flat[1:], unit=options.unit, allowance=options.allowance)
             lines.append(f"wrote {options.pattern}, true to scale")
-        return pipeline.Account(facts, [*lines, mapped.status.value], certified.apart)
+        return pipeline.Account(facts, [*lines, mapped.message], certified.apart)
 
     return pipeline.Changed(mesh.with_places(map_options.pack_islands(options, mapped.mesh)), describe)
 
