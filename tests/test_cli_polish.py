@@ -132,6 +132,17 @@ class TestHarmonise:
         assert "eta must be a positive number" in capsys.readouterr().err
         assert not (tmp_path / "o.obj").exists()
 
+    def test_counts_the_islands_that_are_unchanged(self, tmp_path, capsys):
+        V, F = disk(4)
+        uv = np.concatenate([V, V + np.array([3, 0])])
+        mesh = io.MeshData(uv.copy(), np.concatenate([F, F + len(V)]))
+        uv[np.hypot(*uv.T) < 0.5] += [0.2, 0.05]
+        io.write_obj(tmp_path / "m.obj", mesh.with_map(uv))
+        arguments = tmp_path / "m.obj", "-o", tmp_path / "o.obj", "--energy", "area", "--max-iterations", 5
+        assert run("harmonise", *arguments) == 0
+        said = capsys.readouterr().out
+        assert "Worst outcome, on 1 of 2 islands: Every triangle is strictly positive, verified exactly, but" in said
+
     @pytest.mark.parametrize("command", ["polish", "harmonise"])
     def test_rejects_flat_rest_triangles(self, star, tmp_path, capsys, command):
         """The message does not advise options that the command does not have."""
