@@ -307,17 +307,21 @@ def test_the_command(head, tmp_path, capsys):
 
 
 def test_errors_of_the_command(head, tmp_path, capsys):
-    V, F, _ = head
+    V, F, loop = head
     surface = tmp_path / "head.obj"
     io.write_obj(surface, io.MeshData(V, F))
     np.save(tmp_path / "short.npy", np.zeros((3, 7, 2)))
     np.save(tmp_path / "none.npy", np.zeros((0, 60, 2)))
     (tmp_path / "no.npy").write_bytes(b"nothing")
+    broken = np.ones((4, len(loop), 2))
+    broken[2:, 5:7] = np.nan
+    np.save(tmp_path / "nan.npy", broken)
     (tmp_path / "empty").mkdir()
     for frames, options, words in (
         ("short.npy", [], "must be real numbers of shape"),
         ("none.npy", [], "must be real numbers of shape"),
         ("no.npy", [], "not an array of numbers"),
+        ("nan.npy", [], "nan.npy: frame 2 is not finite at rows 5, 6: give finite numbers"),
         ("missing.npy", [], "missing.npy: there is no such file"),
         ("short.npy", ["-o", tmp_path / "out"], "the same output is given twice"),
         ("short.npy", ["-o", tmp_path / "f.gif", "--frames-per-second", 60], "of a GIF must be at most 50"),

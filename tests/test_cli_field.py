@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -117,3 +118,11 @@ def test_a_volume_that_cannot_be_mended_is_not_written(tmp_path, capsys):
     assert main(fixed) == 2
     assert not (tmp_path / "mended.npy").exists()
     assert "fold" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("shape", [(12, 12, 2), (5, 6, 6, 3)])
+def test_progress_on_a_terminal(tmp_path, capsys, monkeypatch, shape):
+    np.save(tmp_path / "field.npy", np.random.default_rng(0).normal(size=shape))
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    assert main(["field", str(tmp_path / "field.npy"), "-o", str(tmp_path / "new.npy")]) == 0
+    assert re.search(r"\riteration \d+   patches 1   free points \d+", capsys.readouterr().err)

@@ -63,6 +63,12 @@ def test_a_soup_has_no_seams_to_ignore(capsys, tmp_path, seams):
     assert "each mapped on its own (qhm check lists vertices to weld)" in capsys.readouterr().out
 
 
+def test_advice_on_a_soup_names_the_option(capsys, tmp_path):
+    io.write_mapped(tmp_path / "a.ply", MeshData(V[F].reshape(-1, 2), SOUP).with_map(V[F].reshape(-1, 2)))
+    assert main(["flatten", str(tmp_path / "a.ply"), "--seams", "none", "-o", str(tmp_path / "b.ply")]) == 0
+    assert capsys.readouterr().err.endswith("Weld these vertices with --weld 1e-06.\n")
+
+
 def test_a_folder_that_is_missing(capsys, tmp_path):
     assert main(["animate", str(tmp_path / "a.obj"), str(tmp_path / "frames"), "-o", str(tmp_path / "b.gif")]) == 2
     assert capsys.readouterr().err == f"qhm animate: {tmp_path / 'frames'}: there is no such file or folder\n"

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from quasiharmonic import boundary_loops, distortion, io, polish
 from quasiharmonic.surfaces import disk
+from quasiharmonic.util.progress import end_work
 from shared.commands import run, write_input
 from shared.solvable_problems import star_problem
 
@@ -47,6 +50,31 @@ class TestPolish:
         with pytest.raises(SystemExit):
             run("map", star, "-o", tmp_path / "o.obj", "--polish", "mips", "--no-polish")
         assert "not allowed" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        ("stop", "status", "message"),
+        [
+            (lambda step: end_work(), "time_limit", "The time limit ended the work."),
+            (Mock(side_effect=KeyboardInterrupt), "interrupted", "Interrupted. This is the best map so far"),
+        ],
+        ids=["time limit", "Ctrl-C"],
+    )
+    def test_the_few_steps_end_early(self, star, tmp_path, monkeypatch, capsys, stop, status, message):
+        """The time limit is also that of the polish, and the text report says why the work ended."""
+        callbacks = iter([None, stop])
+
+        @contextmanager
+        def progress_line():
+            yield next(callbacks)
+
+        monkeypatch.setattr("quasiharmonic.ui.cli.process.progress_line", progress_line)
+        out, report = tmp_path / "o.obj", tmp_path / "r.json"
+        assert run("map", star, "-o", out, "--time-limit", 60, "--json", report) == 0
+        assert next(callbacks, "none left") == "none left"
+        facts = json.loads(report.read_text())
+        assert (facts["status"], facts["injective"]) == (status, True)
+        assert message in capsys.readouterr().out
+        assert run("check", out) == 0
 
     @pytest.mark.slow
     def test_lowers_distortion_and_stays_certified(self, star, tmp_path, capsys):
@@ -103,6 +131,17 @@ class TestHarmonise:
         assert run("harmonise", star, "-o", tmp_path / "o.obj", "--eta", "-1") == 2
         assert "eta must be a positive number" in capsys.readouterr().err
         assert not (tmp_path / "o.obj").exists()
+
+    def test_counts_the_islands_that_are_unchanged(self, tmp_path, capsys):
+        V, F = disk(4)
+        uv = np.concatenate([V, V + np.array([3, 0])])
+        mesh = io.MeshData(uv.copy(), np.concatenate([F, F + len(V)]))
+        uv[np.hypot(*uv.T) < 0.5] += [0.2, 0.05]
+        io.write_obj(tmp_path / "m.obj", mesh.with_map(uv))
+        arguments = tmp_path / "m.obj", "-o", tmp_path / "o.obj", "--energy", "area", "--max-iterations", 5
+        assert run("harmonise", *arguments) == 0
+        said = capsys.readouterr().out
+        assert "Worst outcome, on 1 of 2 islands: Every triangle is strictly positive, verified exactly, but" in said
 
     @pytest.mark.parametrize("command", ["polish", "harmonise"])
     def test_rejects_flat_rest_triangles(self, star, tmp_path, capsys, command):

@@ -393,6 +393,13 @@ def test_wrong_files_of_seams_and_labels(model, tmp_path, capsys, option, text, 
     assert not (tmp_path / "out.obj").exists()
 
 
+@pytest.mark.parametrize("which", ["groups", "materials"])
+def test_labels_that_the_file_lacks(tmp_path, capsys, which):
+    io.write_ply(tmp_path / "model.ply", io.MeshData(V, F))
+    assert run("unwrap", tmp_path / "model.ply", "-o", tmp_path / "out.obj", "--labels", which) == 2
+    assert f"model.ply: the file has no {which}: omit --labels" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_up_on_the_command_line(model, tmp_path):
     out = tmp_path / "out.obj"

@@ -120,6 +120,17 @@ def test_guides_are_short(page):
     assert [line for line in lines if len(line) > 100 and not line.startswith("|")] == []
 
 
+@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.stem)
+def test_guides_say_how_to_install_what_they_import(page):
+    text = page.read_text(encoding="utf-8")
+    imported = {first or second for first, second in re.findall(r"^(?:import (\w+)|from (\w+)\S* import )", text, re.M)}
+    installed = {"quasiharmonic", "numpy", "scipy", "matplotlib", *sys.stdlib_module_names}
+    names = {"skfem": "scikit-fem", "skimage": "scikit-image", "nibabel": r"\.\[neuro\]"}
+    commands = re.findall(r"pip\s+install ([^`\n]*)", text)
+    for name in imported - installed:
+        assert any(re.search(rf"(?<!\w){names.get(name, name)}(?!\w)", packages) for packages in commands), name
+
+
 def test_pictures_import_only_what_the_package_requires():
     for case in CASES:
         (blocks,) = case.values

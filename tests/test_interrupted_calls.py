@@ -22,7 +22,7 @@ from quasiharmonic import (
     warp_by_landmarks,
 )
 from quasiharmonic.apps.tetrahedra.result import TetrahedraStatus
-from quasiharmonic.energies.polishing import polish_map
+from quasiharmonic.energies.polishing import polish_map, smooth
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.search.stages import CoarseToFine
 from quasiharmonic.surfaces import disk
@@ -77,6 +77,15 @@ def test_a_time_limit_at_the_last_step_of_a_search_ends_the_call():
     assert result.injective
     assert result.status is Status.TIME_LIMIT
     assert result.n_iterations == last
+
+
+def test_before_the_first_step_of_the_short_polish(monkeypatch):
+    problem = star(8)
+    found = solve(problem)
+    monkeypatch.setattr("quasiharmonic.energies.polishing.polish_map", Mock(side_effect=KeyboardInterrupt))
+    result = smooth(problem, found)
+    assert result.status is Status.INTERRUPTED
+    assert result.uv is found.uv
 
 
 @pytest.fixture(scope="module")

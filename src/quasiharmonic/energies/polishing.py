@@ -290,14 +290,16 @@ def smooth(
 
     Return the unchanged result if the mesh has more than `LARGEST_SMOOTHED` triangles and does not slide, or if a rest
     triangle has no area. With ``slide``, maps of any size are smoothed, because only polishing slides the boundary. See
-    `polish` for the options.
+    `polish` for the options. If it is interrupted, the result is the best map so far with status ``INTERRUPTED``.
     """
     if (len(problem.F) > LARGEST_SMOOTHED and slide is False) or rest_shapes(problem.V, problem.F).flat.size:
         return result
     options = PolishOptions(
         energy="blend", max_iterations=SMOOTHING_STEPS, linear_solver=linear_solver, callback=callback, slide=slide
     )
-    smoother = polish_result(problem, result, options)
+    run = Run()
+    with run.until_interrupted():
+        result = polish_result(problem, result, options)
     # Convergence is not the goal here, so the status does not report its absence.
-    interrupted = smoother.status is Status.INTERRUPTED
-    return smoother if interrupted else replace(smoother, status=Status.INJECTIVE)
+    interrupted = run.interrupted or result.status is Status.INTERRUPTED
+    return replace(result, status=Status.INTERRUPTED if interrupted else Status.INJECTIVE)

@@ -2,7 +2,8 @@
 
 A public function with a callback is decorated with `reports_progress` and calls the callback at every step. Code that
 may run long between two steps calls `heartbeat` regularly. If no step was reported for `INTERVAL`, `heartbeat` reports
-the last step again. After a time limit, `heartbeat` ends the work like Ctrl-C.
+the last step again. After a time limit, `heartbeat` ends the work like Ctrl-C. A function without a callback calls
+`report` at every step, which has an effect in a block of `report_to`.
 """
 
 from __future__ import annotations
@@ -78,6 +79,21 @@ def reports_progress(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return report_progress
+
+
+@contextmanager
+def report_to(callback: Callable[[Any], object] | None) -> Iterator[None]:
+    """Pass the steps of `report` in a block to a callback, if there is one, and let `heartbeat` repeat the last one."""
+    with use_value(_REPORTER, None if callback is None else _Reporter(callback)):
+        yield
+
+
+def report(step: Any) -> None:
+    """Pass a step to the callback of the surrounding block of `report_to`, if there is one; then as `heartbeat`."""
+    reporter = _REPORTER.get()
+    if reporter is not None:
+        reporter.report(step)
+    heartbeat()
 
 
 class TimeLimit:

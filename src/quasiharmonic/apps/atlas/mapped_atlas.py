@@ -120,6 +120,16 @@ class MappedAtlas(Outcome):
         """The status of the island that made the least progress."""
         return Status.most_severe(island.result.status for island in self.islands)
 
+    @property
+    def message(self) -> str:
+        """The message of the status, with the number of islands that have it if others have another one."""
+        status, count = self.status, len(self.islands)
+        share = sum(island.result.status is status for island in self.islands)
+        # Ctrl-C ends the work on all islands, and if the status is INJECTIVE, all islands are injective.
+        if share == count or status in (Status.INTERRUPTED, Status.INJECTIVE):
+            return super().message
+        return f"Worst outcome, on {share} of {count} islands: {super().message}"
+
     def places(self) -> list[FloatArray]:
         """Return the vertex positions of every island, in the order of its result."""
         done = [one.result.uv * MIRROR if one.mirrored else one.result.uv for one in self.islands]

@@ -38,6 +38,14 @@ from quasiharmonic.util.outcome import SummarisedOutcome
 _TRIANGLES = np.array([[0, 1, 2], [1, 3, 0], [2, 0, 3], [3, 2, 1]])
 
 
+class FieldStep(NamedTuple):
+    """Progress of the search for the nearest field."""
+
+    iteration: int  # Steps of the current descent
+    patches: int  # Patches that have not converged
+    points: int  # Free pixels or voxels of the current descent
+
+
 class _Words(NamedTuple):
     """Words for the points of a grid, in messages."""
 

@@ -33,14 +33,21 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.displacement_fields.grid import PixelGrid, find_cells, find_points, grow, label_patches
+from quasiharmonic.apps.displacement_fields.grid import (
+    FieldStep,
+    PixelGrid,
+    find_cells,
+    find_points,
+    grow,
+    label_patches,
+)
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, Isotropic
 from quasiharmonic.energies.newton.line_search import backtrack_each
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from quasiharmonic.util.progress import heartbeat
+from quasiharmonic.util.progress import report
 
 if TYPE_CHECKING:
     from scipy.sparse import dia_array
@@ -205,13 +212,14 @@ def _descend_batches(patches: _Patches, weight: float, steps: int) -> None:
 
 def _descend(patches: _Patches, todo: IntArray, weight: float, steps: int) -> None:
     """Converge the patches ``todo`` for one weight of the energy; the matrix only has patches that still move."""
-    while todo.size and steps:
+    iteration = 0
+    while todo.size and iteration < steps:
         batch = _Batch(patches, todo, weight)
         moving = np.ones(todo.size, dtype=bool)
-        while steps and 2 * np.count_nonzero(moving) > todo.size:
-            heartbeat()
+        while iteration < steps and 2 * np.count_nonzero(moving) > todo.size:
+            report(FieldStep(iteration, int(np.count_nonzero(moving)), batch.free.size))
             moving &= batch.step(moving)
-            steps -= 1
+            iteration += 1
         batch.enter(patches.w)
         todo = todo[moving]
 

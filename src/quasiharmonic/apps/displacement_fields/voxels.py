@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.displacement_fields.grid import (
+    FieldStep,
     Grid,
     NearestField,
     check_field,
@@ -36,7 +37,7 @@ from quasiharmonic.apps.tetrahedra.descent import ShapeEnergy, TetrahedraDescent
 from quasiharmonic.apps.tetrahedra.elements import ExactSigns, inspect_faces
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, enumerate_each
 from quasiharmonic.util.outcome import Verdict
-from quasiharmonic.util.progress import heartbeat
+from quasiharmonic.util.progress import heartbeat, report
 
 # Orders of the axes x, y, z, and the sign that makes the determinant of the steps positive at rest.
 _ORDERS = tuple((p, int(np.linalg.det(np.eye(3)[list(p)]).round())) for p in permutations(range(3)))
@@ -308,8 +309,9 @@ def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArr
             around = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in place)
             if number in wanted:
                 mask = labels[around] == number
-                if not _repair_patch(grid.spacing, field[around], given[around], mask, min_jacobian):
+                if not _repair_patch(grid.spacing, field[around], given[around], mask, min_jacobian, len(wanted)):
                     again[around] |= mask
+                wanted.remove(number)
         if not again.any():
             return
         margin *= _TUNING.growth
@@ -320,11 +322,12 @@ def _repair(grid: VoxelGrid, field: FloatArray, wrong: BoolArray, fixed: BoolArr
 
 
 def _repair_patch(
-    spacing: FloatArray, field: FloatArray, given: FloatArray, mask: BoolArray, min_jacobian: float
+    spacing: FloatArray, field: FloatArray, given: FloatArray, mask: BoolArray, min_jacobian: float, left: int
 ) -> bool:
     """Replace the displacements of one patch by the nearest ones without folds; return whether any were found.
 
-    ``field`` and ``given`` are parts of the new and the given field around the patch, and ``mask`` its voxels.
+    ``field`` and ``given`` are parts of the new and the given field around the patch, and ``mask`` its voxels. ``left``
+    is the number of patches from this one on.
     """
     grid = VoxelGrid(mask.shape, spacing)
     nodes, number = np.unique(grid.tetrahedra(grid.number_cells(find_cells(mask))), return_inverse=True)
@@ -338,12 +341,15 @@ def _repair_patch(
     energy = ShapeEnergy(T, rest, floor=min(_TUNING.aim * min_jacobian + 1e-9, 0.99))
     descent = TetrahedraDescent(energy, free, before, anchor=(before, 1.0 / len(T)))
     with np.errstate(all="ignore"):
-        if not descent.make_valid(max_steps=200):
+        if not descent.is_valid():
+            for _ in descent.untangle(max_steps=200):
+                report(FieldStep(descent.iterations, left, free.size))
+        if not descent.is_valid():
             return False
         for weight in _TUNING.weights:
             descent.anchor = before, 1.0 / (weight * len(T))
             for _ in descent.polish(max_steps=8, tol=1e-4):
-                pass
+                report(FieldStep(descent.iterations, left, free.size))
     X = descent.X
     near = np.flatnonzero((np.abs(X - before) < _TUNING.return_distance).all(axis=1))
     back = X.copy()

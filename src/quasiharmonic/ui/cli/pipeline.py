@@ -191,7 +191,7 @@ def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str
     lines = [f"wrote {output}: {written.summary()}"]
     results = [island.result for island in mapped.islands]
     if not written.injective:
-        lines.append(mapped.status.value)
+        lines.append(mapped.message)
     # Each surface may be injective although pins make an overlap between surfaces unavoidable.
     if not written.injective or mapped.status is Status.IMPOSSIBLE:
         lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
@@ -199,6 +199,17 @@ def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str
     seconds = sum(result.seconds for result in results)
     lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
     return "\n".join(lines)
+
+
+def describe_end(mapped: MappedAtlas, written: WrittenMap) -> list[str]:
+    """Return the message of an injective map for the text report, where `describe_maps` does not imply it."""
+    from quasiharmonic.problem.result import Status
+
+    ended_early = mapped.status in (Status.INTERRUPTED, Status.TIME_LIMIT)
+    # The other messages say that every triangle is positive, which is not true of mirrored islands.
+    if not written.injective or mapped.status is Status.INJECTIVE or (written.mirrored and not ended_early):
+        return []
+    return [mapped.message]
 
 
 @dataclass

@@ -193,10 +193,12 @@ def _targets(files: list[Path], mesh: MeshData, fixed: NDArray[np.int64]) -> NDA
 
 
 def _array(path: Path, n: int, fixed: NDArray[np.int64]) -> NDArray[np.float64]:
+    import numpy as np
+
     from quasiharmonic import io
     from quasiharmonic.io.errors import report_damage
     from quasiharmonic.io.untrusted import read_npy
-    from quasiharmonic.util.arrays import real_array
+    from quasiharmonic.util.arrays import names_of, real_array
 
     if not path.is_file():
         raise io.MeshFileError(path, "there is no such file")
@@ -208,7 +210,14 @@ def _array(path: Path, n: int, fixed: NDArray[np.int64]) -> NDArray[np.float64]:
             f"{path}: must be real numbers of shape (frames, {n}, 2), or (frames, {fixed.size}, 2) for fixed vertices "
             f"only, not {array.dtype} {array.shape}"
         )
-    return real_array(f"{path}: its array", array if array.shape[1] == fixed.size else array[:, fixed])
+    rows = np.arange(fixed.size) if array.shape[1] == fixed.size else fixed
+    positions = real_array(f"{path}: its array", array[:, rows])
+    frames, places = np.nonzero(~np.isfinite(positions).all(axis=2))
+    if frames.size:
+        where = names_of("row", "rows", rows[places[frames == frames[0]]])
+        with report.name_source(path):
+            raise ValueError(f"frame {frames[0]} is not finite at {where}: give finite numbers")
+    return positions
 
 
 def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[bool, list[str]]:

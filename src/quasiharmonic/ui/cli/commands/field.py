@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from quasiharmonic.apps.displacement_fields.grid import FieldStep
     from quasiharmonic.io.fields import DisplacementField
 
 
@@ -70,6 +71,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.apps.displacement_fields.voxels import describe_fixed
     from quasiharmonic.io.fields import field_suffix, read_field
     from quasiharmonic.util.outcome import as_plain
+    from quasiharmonic.util.progress import report_to
 
     report.check_new({"-o": options.output, "--inverse": options.inverse}, options.json, inputs=(options.input,))
     outputs = [path for path in (options.output, options.inverse) if path is not None]
@@ -79,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
     for path in outputs:
         given.check_output(path)
     field, spacing = given.field, _spacing(options, given)
-    with report.name_source(options.input):
+    with pipeline.show_work(options.input, _words) as show, report_to(show):
         held = _border(field) if options.fix_border else None
         try:
             repaired = nearest_invertible(field, spacing=spacing, min_jacobian=options.min_jacobian, fixed=held)
@@ -118,6 +120,10 @@ def run(options: argparse.Namespace) -> int:
         return pipeline.Account(facts, lines, invertible or options.inverse is None)
 
     return pipeline.finish(options, describe, options.output)
+
+
+def _words(step: FieldStep) -> str:
+    return f"iteration {step.iteration}   patches {step.patches}   free points {step.points}"
 
 
 def _spacing(options: argparse.Namespace, given: DisplacementField) -> float | list[float]:

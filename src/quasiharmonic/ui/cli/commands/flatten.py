@@ -110,7 +110,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
     triangles = np.array([len(island.F) for island in found.mesh.islands])
     kept = np.flatnonzero(joint == np.arange(len(mesh.V)))
     if (close := kept[find_close_vertices(mesh.V[kept], triangles)]).size:
-        process.tell(describe_soup(close))
+        process.tell(report.in_options(describe_soup(close)))
     given |= pick(options, "start", "rings", "islands", "linear_solver", *declare_options(FlattenOptions))
     with pipeline.show_work(options.input) as show:
         # With a gap of at most two allowances, those of two pieces would touch.
@@ -149,7 +149,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
             facts["pattern"] = str(options.pattern)
             write_pattern(options.pattern, *flat[1:], unit=options.unit, allowance=options.allowance)
             lines.append(f"wrote {options.pattern}, true to scale")
-        return pipeline.Account(facts, [*lines, mapped.status.value], certified.apart)
+        return pipeline.Account(facts, [*lines, mapped.message], certified.apart)
 
     return pipeline.Changed(mesh.with_places(map_options.pack_islands(options, mapped.mesh)), describe)
 

@@ -110,6 +110,7 @@ def _map(
     from quasiharmonic.apps.atlas.mapped_atlas import each_island, merge_refined
     from quasiharmonic.energies.polishing import smooth
     from quasiharmonic.problem.result import Status
+    from quasiharmonic.problem.run import run_within
     from quasiharmonic.solver.mapping import solve
     from quasiharmonic.solver.refinement import on_refinement
     from quasiharmonic.solver.search.stages import select_strategy
@@ -138,8 +139,10 @@ def _map(
         if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
             # The short default polish lowers the worst distortion at little cost.
             fine = on_refinement(problem, result.refined)
+            given = {"linear_solver": options.linear_solver, "slide": one.slide}
+            left = None if options.time_limit is None else options.time_limit - result.seconds
             with process.progress_line() as show:
-                result = smooth(fine, result, linear_solver=options.linear_solver, callback=show, slide=one.slide)
+                return run_within(left, lambda: smooth(fine, result, callback=show, **given))
         return result
 
     with report.name_source(source):
@@ -182,6 +185,7 @@ def _map(
             if one.result.crowded.size
         ]
         lines = [pipeline.describe_maps(mapped, certified, options.output), *notes]
+        lines += pipeline.describe_end(mapped, certified)
         return pipeline.Account(facts, lines, certified.injective)
 
     return pipeline.Changed(new, describe)

@@ -139,11 +139,7 @@ def lower_distortion(
             }
             lines = [pipeline.describe_maps(after, written, options.output)]
             if written.injective:
-                lines += [
-                    *notes,
-                    _change(options.energy, *measured),
-                    *([] if written.mirrored else [after.status.value]),
-                ]
+                lines += [*notes, _change(options.energy, *measured), *pipeline.describe_end(after, written)]
             return pipeline.Account(facts, lines, written.injective)
 
         return pipeline.Changed(mesh.with_places(map_options.pack_islands(options, after.mesh)), describe)

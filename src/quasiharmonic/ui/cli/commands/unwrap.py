@@ -35,6 +35,7 @@ from quasiharmonic.ui.cli.arguments import (
     flag,
     number,
     pick,
+    set_default,
     steps,
     text,
     texture_size,
@@ -105,7 +106,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
             default=0,
         ),
         seams_channel=number(
-            steps, "set of the file's texture coordinates whose seams --keep-seams keeps (default: 0)", default=0
+            steps, "set of the file's texture coordinates that --keep-seams and --faces keep (default: 0)"
         ),
         bake=flag("bake the look of the model into textures for the new texture coordinates"),
         memory=number(byte_count, "stop if more resident memory is used, such as 800M or 4G", metavar="SIZE"),
@@ -118,6 +119,8 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
 
     began = time.perf_counter()
+    keeps = options.keep_seams or options.faces is not None
+    set_default(options, "seams_channel", 0, asked=keeps, belongs="--keep-seams")
     io.find_format(options.output, "write_map", "seams")
     if options.channel:
         io.find_format(options.output, "write_map", "channels")
@@ -297,13 +300,16 @@ def _labels_file(which: str | None) -> Path | None:
 
 def _labels(mesh: MeshData, which: str | None) -> Any:
     """Return the labels (f,) of the triangles that ``--labels`` names."""
-    from quasiharmonic.apps.unwrapping.model_files import statement_labels
+    from quasiharmonic.apps.unwrapping.model_files import label_statements, statement_labels
     from quasiharmonic.util.arrays import count_of
 
     if which is None:
         return None
     if (path := _labels_file(which)) is None:
-        return statement_labels(mesh, *{"groups": ("o", "g"), "materials": ("usemtl",)}[which])
+        keywords = {"groups": ("o", "g"), "materials": ("usemtl",)}[which]
+        if not any(label_statements(mesh, keyword)[1] for keyword in keywords):
+            raise ValueError(f"the file has no {which}: omit --labels, or give a file with the part of each face")
+        return statement_labels(mesh, *keywords)
     labels = _read_integers(path, 1)[:, 0]
     if len(labels) != mesh.faces:
         raise ValueError(f"{path}: {count_of('number', 'numbers', len(labels))} for {mesh.faces} faces: give one each")
