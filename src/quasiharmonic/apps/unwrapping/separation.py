@@ -29,8 +29,8 @@ _STEPS = 2
 _TOLERANCE = 1e-2
 # The search stops after this number of successive updates without fewer crossings.
 _MAX_STALLS = 4
-# In larger charts, only some vertices move: those at most twice as far from a crossing as crossings are from each other,
-# but at least and at most so many.
+# In larger charts, only some vertices move, at least and at most so many: those at most twice as far from a crossing as
+# crossings are from each other.
 _FEWEST_FREE, _MOST_FREE = 1_000, 5_000
 
 
