@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.exact.predicates import orientation_or_nonfinite
+from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.splitting import fans, find_representatives, number_fans, renumber
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_pairs, group_by_label, pair_keys
 from quasiharmonic.util.arrays import (
@@ -183,6 +184,9 @@ class SeamedMesh:
         corners = self.F[self.mapped] * max(len(place), 1) + place[self.FT[self.mapped]]
         welded = np.unique(corners, return_inverse=True)[1].reshape(-1, 3)
         if self.uv is None:
+            return welded
+        sign = triangle_signs(self.FT[self.mapped], self.uv)[0]
+        if sign.min(initial=1) >= 0 or sign.max(initial=-1) <= 0:
             return welded
         one, other = find_pairs(welded)
         folds = find_folds(one, other, self.uv.take(self.FT[self.mapped], axis=0))
