@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import KEPT_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
-from quasiharmonic.geometry.mesh.topology import label_components
+from quasiharmonic.geometry.mesh.topology import find_pairs, label_components
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
@@ -118,7 +118,7 @@ def _excess(chart: WorkingChart, bound: float) -> FloatArray:
 
 def is_undivided(chart: WorkingChart) -> bool:
     """Return whether all triangles of a chart should stay together, such as those of one polygon."""
-    return bool((chart.cost >= UNDIVIDED_COST).any()) and not _group_undivided(chart.cost, _graph(chart)).any()
+    return bool((chart.cost >= UNDIVIDED_COST).any()) and not group_undivided(chart.F, chart.cost).any()
 
 
 def _graph(chart: WorkingChart) -> EdgeGraph:
@@ -193,10 +193,10 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     with np.errstate(all="ignore"):
         t = np.nan_to_num(near / (near + far), nan=0.5)[chart.F].mean(axis=1)
     k, lowest, highest = len(chart.F), *_TUNING.band
-    group = _group_undivided(chart.cost, graph)
+    group = group_undivided(chart.F, chart.cost)
     if not group.any():
         # The chart is a single polygon or flat face, which can only be divided between its triangles.
-        group = _group_undivided(chart.cost, graph, KEPT_COST)
+        group = group_undivided(chart.F, chart.cost, KEPT_COST)
     if not group.any():
         group = np.arange(k)
     t = _mean_of_groups(t, group)
@@ -239,18 +239,17 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     return line
 
 
-def _group_undivided(cost: FloatArray, graph: EdgeGraph, least: float = UNDIVIDED_COST) -> IntArray:
-    """Label (k,) of the group of triangles that should stay together: its first triangle.
+def group_undivided(F: IntArray, cost: FloatArray, least: float = UNDIVIDED_COST) -> IntArray:
+    """Label (k,) of the group of triangles (k, 3) that should stay together: its first triangle.
 
-    ``cost`` (k, 3) are the factors of the sides; triangles stay together at factors of at least ``least``.
+    Triangles stay together at sides with a cost factor, ``cost`` (k, 3), of at least ``least``.
     """
-    dear_sides = cost >= least
-    if not dear_sides.any():
-        return np.arange(len(cost))
-    first, second, edge = graph.list_pairs()
-    dear = mark(len(graph.ends), graph.side.T[dear_sides])
-    joined = dear[edge]
-    return label_components(first[joined], second[joined], len(cost))
+    dear = (cost >= least).ravel()
+    if not dear.any():
+        return np.arange(len(F))
+    one, other = find_pairs(F)
+    joined = dear[one] | dear[other]
+    return label_components(one[joined] // 3, other[joined] // 3, len(F))
 
 
 def _mean_of_groups(values: FloatArray, group: IntArray) -> FloatArray:

@@ -13,12 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart
-from quasiharmonic.apps.unwrapping.chart_cuts import divide, divide_overlap, is_undivided
+from quasiharmonic.apps.unwrapping.chart_cuts import divide, divide_overlap, group_undivided, is_undivided
 from quasiharmonic.apps.unwrapping.chart_maps import WORST_STRETCH
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.layout import GRID_UNIT, ChartLayout, grid_unit
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
-from quasiharmonic.geometry.mesh.topology import find_pairs, label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
@@ -146,10 +145,7 @@ def _halve(chart: Chart, cost: FloatArray) -> list[Chart]:
     width, height = shape.extent(shape.direction)
     along = shape.direction if width >= height else 1j * shape.direction
     at = (chart.uv @ [1, 1j] / along).real
-    one, other = find_pairs(chart.F)
-    dear = (cost[chart.triangles] >= UNDIVIDED_COST).ravel()
-    joined = dear[one] | dear[other]
-    group = label_components(one[joined] // 3, other[joined] // 3, len(chart.F))
+    group = group_undivided(chart.F, cost[chart.triangles])
     middle = np.bincount(group, at[chart.F].mean(axis=1)) / np.maximum(np.bincount(group), 1)
     first = middle[group] < (at.min() + at.max()) / 2
     if first.all() or not first.any():
