@@ -31,7 +31,7 @@ def places(one):
     return mesh.uv[mesh.FT]
 
 
-def test_a_map_with_inverted_triangles_is_shown_as_it_is_and_repaired(tmp_path):
+def test_a_map_with_inverted_triangles_is_shown_as_it_is_and_repaired(tmp_path, monkeypatch):
     V, F = cat(8)
     uv = V[:, :2].copy()
     inner = int(np.argmin(np.linalg.norm(uv - uv.mean(axis=0), axis=1)))
@@ -48,6 +48,10 @@ def test_a_map_with_inverted_triangles_is_shown_as_it_is_and_repaired(tmp_path):
     assert shown["injective"]
     assert shown["command"] == "qhm repair model.obj -o repaired.obj"
     moved = (places(one) != uv[F]).any(axis=(1, 2))
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(shown["python"], names)
+    assert np.array_equal(names["mesh"].uv[names["mesh"].FT], places(one))
     assert 0 < np.count_nonzero(moved) < len(F) / 2
     one.does("undo")
     assert not one.last("map").header["injective"]

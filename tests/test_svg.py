@@ -145,6 +145,9 @@ def test_invalid_path_data(d, message):
         ('<rect width="1" height="1" transform="skewX(50),skewY(10)"/>', None, 4),
         ('<svg x="5"><rect width="1" height="1"/></svg>', [1], 4),
         ('<g display="none"><circle r="9"/></g><rect width="1" height="1"/>', [1], 4),
+        ('<g display=" none "><circle r="9"/></g><rect width="1" height="1"/>', [1], 4),
+        ('<circle r="9" visibility="hidden"/><rect width="1" height="1"/>', [1], 4),
+        ('<circle r="9" style="visibility: hidden"/><rect width="1" height="1"/>', [1], 4),
         (
             '<style>.a{fill:red;stroke-width:2}</style><rect width="1" height="1" style="fill:blue;x-offset:3"/>',
             [1],
@@ -219,6 +222,7 @@ def test_tolerance(read, tolerance):
             "<g>: 'transform' in a style is not supported at line 1",
         ),
         (drawing('<circle style="r:3px" r="1"/>'), "'r' in a style is not supported"),
+        (drawing("<style>.a{fill:red;display:none}</style>"), "'display:none' in a style sheet is not supported"),
         (drawing('<path style="d:path(&quot;M0 0&quot;)"/>'), "'d' in a style is not supported"),
         (drawing("<defs><style>.a{fill:red;translate:3px}</style></defs>"), "<style>: 'translate' in a style is not"),
         (drawing('<g transform="scale(2)" transform-origin="3 3"/>'), "<g>: transform-origin is not supported"),

@@ -123,8 +123,10 @@ def test_a_model_of_several_parts(cell):
     np.testing.assert_array_equal(widget.mesh.islands[0].uv, before)
     np.testing.assert_array_equal(widget.mesh.islands[1].uv, widget.result.uv)
     widget.flatten()
-    widget.unwrap(resolution=256)
+    widget.unwrap(resolution=np.int64(256))
     assert widget.mesh.uv.min() >= 0
+    with pytest.raises(ValueError, match="max_stretch"):
+        widget.unwrap(max_stretch=-1)
     with pytest.raises(ValueError, match="a list of numbers below 2"):
         widget.select([7])
 

@@ -42,7 +42,9 @@ _TRANSFORM = re.compile(r"[\s,]*([a-zA-Z]+)\s*\(([^()]*)\)[\s,]*")
 _SHAPING = re.compile(
     r"(?:^|[;{\s])\s*(transform(?:-origin)?|translate|rotate|scale|offset-path|d|[cr]?[xy]|r)\s*:", re.IGNORECASE
 )
-_HIDDEN = re.compile(r"(?:^|;)\s*display\s*:\s*none\s*(?:;|!|$)")
+# Rules of style sheets that would hide shapes. It is not read to which shapes they apply, so they raise an error.
+_HIDING = re.compile(r"[;{\s](display\s*:\s*none|visibility\s*:\s*(?:hidden|collapse))\b", re.IGNORECASE)
+_HIDDEN = re.compile(r"(?:^|;)\s*(?:display\s*:\s*none|visibility\s*:\s*(?:hidden|collapse))\s*(?:;|!|$)")
 
 
 def read_svg(path: str | os.PathLike[str], *, tolerance: float = 1e-6) -> list[FloatArray]:
@@ -183,7 +185,8 @@ class _Drawing:
             return
         if self.depth == 1 and (tag != "svg" or namespace not in ("", _SVG)):
             raise self._error(f"is not an SVG drawing: the root element is {tag[:40]!a}")
-        hidden = attributes.get("display") == "none" or _HIDDEN.search(attributes.get("style", ""))
+        shown = (attributes.get(name, "").strip() for name in ("display", "visibility"))
+        hidden = not {"none", "hidden", "collapse"}.isdisjoint(shown) or _HIDDEN.search(attributes.get("style", ""))
         if namespace not in ("", _SVG) or hidden or not (tag in _CONTAINERS or tag in _SHAPES or tag in _FOREIGN):
             self.skipped = self.depth
             return
@@ -211,6 +214,9 @@ class _Drawing:
         if self.sheet is not None:
             sheet, self.sheet = "".join(self.sheet), None
             self._check_style("style", sheet)
+            if found := _HIDING.search(sheet):
+                remedy = "hide the shapes by attributes, or delete them"
+                raise self._error(f"<style>: {found.group(1)!r} in a style sheet is not supported", remedy)
         if self.skipped == self.depth:
             self.skipped = 0
         elif not self.skipped:

@@ -118,7 +118,8 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
 
     def unwrap(self, *, max_stretch: float = 1.5, resolution: int = 2048, padding: float = 4) -> None:
         """Unwrap the whole model, as `quasiharmonic.unwrap` does; raise ValueError if that is not possible."""
-        self._ask({"do": "unwrap", "max_stretch": max_stretch, "resolution": resolution, "padding": padding})
+        options = {"max_stretch": max_stretch}
+        self._ask({"do": "unwrap", "options": options, "resolution": resolution, "padding": padding})
 
     def flatten(self) -> None:
         """Map with a free boundary, as `quasiharmonic.flatten` does; raise ValueError if that is not possible."""

@@ -210,7 +210,8 @@ def repair_islands(state: SessionState, callback: Callback = None) -> SessionSta
     assert mesh.uv is not None
     result = repair(mesh.V, mesh.F, mesh.uv, FT=mesh.FT, callback=callback, **recipes.values(options))
     script = Script()
-    script.let("mesh", public(repair)(source.name, **options).mesh)
+    code = script.let("mesh", public(as_seamed_mesh)(source.name))
+    script.let("mesh", public(repair)(code.V, code.F, code.uv, FT=code.FT, **options).mesh)
     recipe = recipes.record_call("repair", source, "repaired.obj", options, script)
     after = as_it_is(state, result.mesh, recipe, keep=("pins",))
     for k, (one, done) in enumerate(zip(after.islands, result.islands, strict=False)):

@@ -96,8 +96,9 @@ class SessionState:
 
     @property
     def result(self) -> MapResult:
-        """The result of the active island."""
-        assert self.active.result is not None
+        """The result of the active island; ValueError before there is one."""
+        if self.active.result is None:
+            raise ValueError("there is no map yet: unwrap or flatten the model first")
         return self.active.result
 
     @property
@@ -266,9 +267,9 @@ class IslandState:
 
     @cached_property
     def problem(self) -> Problem:
-        """The mapping problem; AssertionError before there is one."""
-        assert self.fixed is not None
-        assert self.target is not None
+        """The mapping problem; ValueError before there is one."""
+        if self.fixed is None or self.target is None:
+            raise ValueError("there is no map yet: unwrap or flatten the model first")
         return Problem(self.island.V, self.island.F, self.fixed, self.target)
 
     @cached_property

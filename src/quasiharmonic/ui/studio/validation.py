@@ -91,6 +91,7 @@ def points(frame: MessageFrame) -> FloatArray:
 def amount(frame: MessageFrame, name: str, low: float, high: float, default: float) -> float:
     """Return a number between two bounds, ``default`` if there is none."""
     value = frame.header.get(name, default)
+    value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise RequestError(f"{name} must be a number from {low:g} to {high:g}")
     return value
