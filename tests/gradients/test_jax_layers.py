@@ -141,9 +141,12 @@ def test_errors():
 def test_the_error_for_a_map_that_is_not_found_names_it():
     problem = held_ring()
     mirrored = np.stack([problem.target, problem.target * [1, -1]])
-    with pytest.raises(Exception, match="no injective map was found") as caught:
-        layers.injective_map(problem, target=mirrored).block_until_ready()
-    assert "MapNotFound" in str(caught.value) + type(caught.value).__name__
+    with pytest.raises(layers.MapNotFound, match="no injective map was found") as found:
+        layers.injective_map(problem, target=mirrored)
+    assert found.value.result.diagnosis is not None
+    with pytest.raises(Exception, match="MapNotFound") as caught:
+        jax.jit(lambda target: layers.injective_map(problem, target=target))(mirrored).block_until_ready()
+    assert "no injective map was found" in str(caught.value)
 
 
 @pytest.mark.parametrize("double", [True, False])

@@ -58,11 +58,15 @@ def apply_layer(make: Callable[..., Layer], settings: tuple[Any, ...], arguments
     # All arrays get the same number of leading axes, so that the axis that `jax.vmap` adds is the first of each.
     axes = [np.ndim(array) - len(layer.shapes[name]) for name, array in zip(names, given, strict=True)]
     most = max(axes, default=0)
-    arrays = (
+    arrays = [
         jnp.expand_dims(jnp.asarray(array, dtype=_find_dtype(name)), tuple(range(most - own)))
         for name, array, own in zip(names, given, axes, strict=True)
-    )
-    maps: jax.Array = _map(layer, names, *arrays)
+    ]
+    if any(isinstance(array, jax.core.Tracer) for array in arrays):
+        maps: jax.Array = _map(layer, names, *arrays)
+    else:
+        # Errors of a callback would lose their class.
+        maps = jnp.asarray(_compute(layer, names, *arrays))
     return maps.astype(np.float32) if single else maps
 
 
