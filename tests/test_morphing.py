@@ -258,3 +258,13 @@ def test_meshes_that_cannot_be_morphed(plate, tmp_path, capsys):
     ):
         write_fem(out, read_fem(path), np.zeros((3, 2)))
     assert not out.exists()
+
+
+def test_a_mesh_that_overlaps_itself_says_so():
+    points, F = surfaces.grid(40, 2)
+    points[:, 0] *= 20
+    edge = np.unique(boundary_edges(F, len(points)))
+    angle, radius = np.radians(430) * points[edge, 0] / 20, 5 - points[edge, 1]
+    result = morph(points, F, edge, np.stack([radius * np.sin(angle), -radius * np.cos(angle)], axis=1))
+    assert result.success
+    assert "overlaps itself" in result.summary()

@@ -95,7 +95,9 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         """Return a text that says whether the mesh is valid, and otherwise what is wrong."""
         qualities = self.describe_quality()
         if self.valid:
-            return f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.\n{qualities}"
+            sound = f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.\n{qualities}"
+            bijective = self.result.certificate.bijective
+            return sound if bijective else f"{sound}\nThe mesh overlaps itself. {self.result.certificate.summary()}"
         lines = [
             f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}. Move the boundary less or in "
             "several steps, and keep inner loops inside the outer loop."
