@@ -328,7 +328,7 @@ def _faces(mesh: MeshData, path: Path | None) -> Any:
 
 
 def _bound_memory(show: Callable[[UnwrapStep], None] | None, limit: int | None) -> Callable[[UnwrapStep], None] | None:
-    """Return a callback that shows steps, and raises MemoryError above the limit of resident memory."""
+    """Return a callback that shows steps, and raises RuntimeError above the limit of resident memory."""
     if limit is None:
         return show
     from quasiharmonic.ui.batch.supervisor import resident
