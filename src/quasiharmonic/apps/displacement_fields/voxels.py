@@ -340,16 +340,17 @@ def _repair_patch(
     free = np.flatnonzero(mask[tuple(index.T)])
     energy = ShapeEnergy(T, rest, floor=min(_TUNING.aim * min_jacobian + 1e-9, 0.99))
     descent = TetrahedraDescent(energy, free, before, anchor=(before, 1.0 / len(T)))
+
+    def show() -> None:
+        report(FieldStep(descent.iterations, left, free.size))
+
     with np.errstate(all="ignore"):
-        if not descent.is_valid():
-            for _ in descent.untangle(max_steps=200):
-                report(FieldStep(descent.iterations, left, free.size))
-        if not descent.is_valid():
+        if not descent.make_valid(max_steps=200, after_step=show):
             return False
         for weight in _TUNING.weights:
             descent.anchor = before, 1.0 / (weight * len(T))
             for _ in descent.polish(max_steps=8, tol=1e-4):
-                report(FieldStep(descent.iterations, left, free.size))
+                show()
     X = descent.X
     near = np.flatnonzero((np.abs(X - before) < _TUNING.return_distance).all(axis=1))
     back = X.copy()

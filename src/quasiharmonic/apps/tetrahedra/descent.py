@@ -24,7 +24,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -289,11 +289,11 @@ class TetrahedraDescent:
             if ratio > 1.0 - _TUNING.quick_decrease or repeated > _TUNING.max_repeated:
                 epsilon, repeated = max(reduce_epsilon(epsilon, least, ratio), _TUNING.min_epsilon), 0
 
-    def make_valid(self, max_steps: int) -> bool:
+    def make_valid(self, max_steps: int, after_step: Callable[[], object] = lambda: None) -> bool:
         """Untangle the mesh if necessary; return whether all determinants are above the floor."""
         if not self.is_valid():
             for _ in self.untangle(max_steps):
-                pass
+                after_step()
         return self.is_valid()
 
     def is_valid(self) -> bool:

@@ -51,7 +51,7 @@ _PERMITTED = 0.5
 _LEAST_RATIO = 0.15
 # Maps with a larger share of inverted triangles are not repaired.
 _FEW = 0.05
-# Rings of triangles around inverted ones that are mapped anew, first and later.
+# Rings of triangles around inverted ones that are mapped again, first and later.
 _RINGS = 2, 6
 # Maps with more crossings of their boundary than this share of its edges are not used.
 _FEW_CROSSINGS = 0.01
@@ -205,7 +205,7 @@ def _direction(p: ComplexArray) -> ComplexArray:
 
 
 def _repair(chart: WorkingChart, uv: FloatArray) -> FloatArray | None:
-    """Map the surroundings of inverted triangles anew, with all other vertices fixed; None if that fails.
+    """Map the surroundings of inverted triangles again, with all other vertices fixed; None if that fails.
 
     If the surroundings have no map, larger ones are mapped.
     """

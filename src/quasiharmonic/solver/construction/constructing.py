@@ -14,8 +14,7 @@ import numpy as np
 
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.exact.certificate import Certificate, certify, inverted_triangles
-from quasiharmonic.geometry.exact.loops import check_loops, winding
-from quasiharmonic.geometry.exact.predicates import orientation
+from quasiharmonic.geometry.exact.loops import LoopEdges, check_loops, find_nesting, winding
 from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import embed_tutte
@@ -108,16 +107,12 @@ def is_simple(problem: Problem) -> bool:
     if len(np.unique(problem.target, axis=0)) < len(problem.target):
         return False
     uv = problem.place_fixed()
-    if check_loops(domain.loops, uv)[1] or sum(_winds_left(uv[loop]) for loop in domain.loops) != 1:
+    if check_loops(domain.loops, uv)[1]:
+        return False
+    if np.count_nonzero(find_nesting(LoopEdges.of(domain.loops, uv))[0] > 0) != 1:
         return False
     turns, on = winding(uv[domain.pins], *uv[domain.edges.boundary.T])
     return bool(np.all(~on & (turns == 1)))
-
-
-def _winds_left(polygon: FloatArray) -> bool:
-    """Whether a simple polygon (k, 2) is counterclockwise, determined exactly at its first corner from the left."""
-    k = int(np.lexsort(polygon.T[::-1])[0])
-    return bool(orientation(polygon[k - 1], polygon[k], polygon[(k + 1) % len(polygon)]) > 0)
 
 
 @dataclass(frozen=True, eq=False)

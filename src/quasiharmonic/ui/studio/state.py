@@ -35,6 +35,7 @@ class StateLimits(NamedTuple):
 
 
 _LIMITS = StateLimits()
+_NO_MAP = "there is no map yet: unwrap or flatten the model first"
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +99,7 @@ class SessionState:
     def result(self) -> MapResult:
         """The result of the active island; ValueError before there is one."""
         if self.active.result is None:
-            raise ValueError("there is no map yet: unwrap or flatten the model first")
+            raise ValueError(_NO_MAP)
         return self.active.result
 
     @property
@@ -269,7 +270,7 @@ class IslandState:
     def problem(self) -> Problem:
         """The mapping problem; ValueError before there is one."""
         if self.fixed is None or self.target is None:
-            raise ValueError("there is no map yet: unwrap or flatten the model first")
+            raise ValueError(_NO_MAP)
         return Problem(self.island.V, self.island.F, self.fixed, self.target)
 
     @cached_property
