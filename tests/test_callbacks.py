@@ -19,7 +19,7 @@ from quasiharmonic import (
     repair,
     solve,
 )
-from quasiharmonic.apps.flattening import piece
+from quasiharmonic.apps.flattening import flattening_run
 from quasiharmonic.solver.search import search
 from quasiharmonic.surfaces import disk
 
@@ -49,6 +49,6 @@ def test_objects_that_are_not_callable_are_rejected_first(take, monkeypatch):
         raise AssertionError("the search has begun")
 
     monkeypatch.setattr(search.Search, "run", computed, raising=False)
-    monkeypatch.setattr(piece.Flattening, "run", computed)
+    monkeypatch.setattr(flattening_run.Flattening, "run", computed)
     with pytest.raises(ValueError, match="callback must be callable, or None, not 3"):
         take(3)

@@ -87,12 +87,12 @@ def test_an_unneeded_cut_is_no_error(head, tmp_path):
 
 
 def test_interrupted_command_writes_the_best_map(head, tmp_path, monkeypatch):
-    from quasiharmonic.apps.flattening import piece
+    from quasiharmonic.apps.flattening import flattening_run
 
     def cut_short(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(piece, "descend", cut_short)
+    monkeypatch.setattr(flattening_run, "descend", cut_short)
     assert run("flatten", head, "-o", tmp_path / "flat.obj") == 0
     written = io.read_mesh(tmp_path / "flat.obj")
     assert certify(written.F, io.map_of(written)).bijective

@@ -111,7 +111,7 @@ class Stuck(SymmetricDirichlet):
 @pytest.mark.slow
 def test_collapse_from_every_start_is_reported_by_the_status(monkeypatch):
     V, F = cat(8)
-    monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
+    monkeypatch.setattr("quasiharmonic.apps.flattening.flattening_run.has_collapsed", lambda *surface, **more: True)
     result = flatten(V, F, energy=Stuck())
     assert result.status is Status.COLLAPSED
     assert result.certificate.bijective
@@ -127,7 +127,7 @@ def test_collapse_from_every_start_is_reported_by_the_status(monkeypatch):
 @pytest.mark.slow
 def test_equal_results_of_two_starts_are_no_collapse(monkeypatch):
     V, F = cut_starfish(3, 10)
-    monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
+    monkeypatch.setattr("quasiharmonic.apps.flattening.flattening_run.has_collapsed", lambda *surface, **more: True)
     result = flatten(V, F)
     assert result.status is Status.POLISHED
     assert result.certificate.bijective
@@ -135,7 +135,7 @@ def test_equal_results_of_two_starts_are_no_collapse(monkeypatch):
 
 @pytest.mark.slow
 def test_a_collapsed_island_is_reported_for_an_atlas(monkeypatch):
-    monkeypatch.setattr("quasiharmonic.apps.flattening.piece.has_collapsed", lambda *surface, **more: True)
+    monkeypatch.setattr("quasiharmonic.apps.flattening.flattening_run.has_collapsed", lambda *surface, **more: True)
     plane, F = disk(3)
     flat = np.column_stack([plane + 5, np.zeros(len(plane))])
     V, G = cat(8)

@@ -8,7 +8,7 @@ import pytest
 from quasiharmonic import flatten
 from quasiharmonic.apps.flattening import free_boundary
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.piece import Flattening
+from quasiharmonic.apps.flattening.flattening_run import Flattening
 from quasiharmonic.results import Status
 from quasiharmonic.surfaces import grid
 

@@ -122,7 +122,7 @@ def test_descents_far_from_an_isometry_factor(factored):
 
 
 def test_flat_surfaces_that_overlap_are_mapped_without_overlaps(monkeypatch):
-    monkeypatch.setattr("quasiharmonic.apps.flattening.piece.ALMOST_FROM", 1000)
+    monkeypatch.setattr("quasiharmonic.apps.flattening.flattening_run.ALMOST_FROM", 1000)
     flat, F = grid(20, 60)
     # A ring sector of 1.1 turns, wound around a cylinder.
     angle, radius = 2.2 * np.pi * flat[:, 1], 1 + 0.4 * flat[:, 0]

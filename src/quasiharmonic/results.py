@@ -12,7 +12,8 @@ from quasiharmonic.apps.atlas.seam_cuts import CutMesh
 from quasiharmonic.apps.baking import BakeResult
 from quasiharmonic.apps.displacement_fields.field_inversion import InverseField
 from quasiharmonic.apps.displacement_fields.nearest import InvertibleField
-from quasiharmonic.apps.displacement_fields.voxels import InverseVolume, InvertibleVolume, VoxelVerdict
+from quasiharmonic.apps.displacement_fields.nearest_voxels import InvertibleVolume, VoxelVerdict
+from quasiharmonic.apps.displacement_fields.voxel_inversion import InverseVolume
 from quasiharmonic.apps.gradients.derivative import Derivative
 from quasiharmonic.apps.image_warp import WarpResult
 from quasiharmonic.apps.inverse_map import ChartInverse, SurfacePoints

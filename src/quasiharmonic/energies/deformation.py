@@ -37,6 +37,8 @@ from quasiharmonic.util.kernels import compiled
 
 # For singular values between this and its inverse, no energy should overflow.
 _EXTREME_STRETCH = 1e20
+# Energies with a relative difference of at most this are equal.
+_EQUAL = 1e-6
 
 
 class DeformationEnergy:
@@ -157,6 +159,11 @@ class DeformationEnergy:
         if mixture is None:
             return float(np.sum(self.share * self.energy.density(d)))
         return mixed_energy(mixture, d.p, d.q, d.det, self.share)
+
+    def is_scale_free(self, w: ComplexArray) -> bool:
+        """Whether the energy of a map (n,) does not depend on its scale."""
+        here, doubled = self.value(w), self.value(2 * w)
+        return abs(doubled - here) <= _EQUAL * here
 
     def gradient(self, w: ComplexArray) -> ComplexArray:
         """Derivative with respect to the positions, ``∂E/∂u + i ∂E/∂v`` at every vertex; (n,) complex128."""

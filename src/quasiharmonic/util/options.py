@@ -357,6 +357,11 @@ class FlattenOptions(DistanceOptions):
     gap: float = option(0.0, check=tolerance)
     weld: Any = option(False, check=check_welding)
 
+    @property
+    def energy_name(self) -> str:
+        """Name of the energy, for reports."""
+        return self.energy if isinstance(self.energy, str) else type(self.energy).__name__
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TetrahedraOptions(Options):

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.displacement_fields.grid import PixelGrid, check_field, check_unfolded
 from quasiharmonic.apps.displacement_fields.nearest import is_fold_free
-from quasiharmonic.apps.displacement_fields.voxels import InverseVolume, inverse_volume
+from quasiharmonic.apps.displacement_fields.voxel_inversion import InverseVolume, inverse_volume
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray

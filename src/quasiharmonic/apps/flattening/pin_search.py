@@ -24,7 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.apps.flattening.air_triangulation import triangulate_air
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.piece import Flattening, Piece, energy_name, to_given_unit
+from quasiharmonic.apps.flattening.flattening_run import Flattening
+from quasiharmonic.apps.flattening.piece import Piece, to_given_unit
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.polishing import find_energy
 from quasiharmonic.geometry.exact.certificate import certify
@@ -294,7 +295,7 @@ class PinSearch:
         self.status = Status.INTERRUPTED
         with self._run.until_interrupted():
             self.status = self._run.descend(
-                f"guarded descent, {energy_name(options)}",
+                f"guarded descent, {options.energy_name}",
                 itertools.islice(descend(descent, find_energy(options.energy), options.tol), options.max_iterations),
                 lambda: descent.distortion,
                 lambda: self._to_target_unit(descent.uv),

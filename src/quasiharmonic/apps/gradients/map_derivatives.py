@@ -19,7 +19,6 @@ from typing import Any, TypedDict, Unpack, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.flattening.piece import is_scale_free
 from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, Scale
 from quasiharmonic.apps.gradients.forces import CorrectedStrain, Forces, RestStrain, Strain, TensorForces
 from quasiharmonic.apps.gradients.freedom import Freedom, Gauge, SlidingFreedom, differentiate_map_size
@@ -372,7 +371,7 @@ def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge
         return None
     # Energies beyond the range of doubles are reported where derivatives are taken.
     with np.errstate(all="ignore"):
-        scales = is_scale_free(measure, w)
+        scales = measure.is_scale_free(w)
     pin = int(domain.fixed[0]) if domain.fixed.size else None
     return Gauge(w, pin, scales, domain.loops)
 

@@ -13,15 +13,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from quasiharmonic.apps.flattening.flattening_run import Flattening
+from quasiharmonic.apps.flattening.initial_maps import COARSE_FROM
 from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
-from quasiharmonic.apps.flattening.piece import COARSE_FROM, Flattening, Piece
+from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import descend_on_patches
-from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
+from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, Energy, Isotropic, SymmetricDirichlet
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
@@ -143,7 +144,7 @@ class WorkingChart:
 
     def use(self, uv: FloatArray) -> None:
         """Use an injective map (m, 2), scaled to the surface's area, and measure it."""
-        self.uv = _fit_scale(self.piece, uv)
+        self.uv = self.piece.fit_scale(uv)
         self.stretch = measure_stretch(self.piece.energy(SymmetricDirichlet(), None), self.uv)
         # Boundaries that are closer than this would touch in the precision of texture coordinates.
         unit = _GAP * np.sqrt(self.piece.area)
@@ -255,12 +256,3 @@ def _relax_long(chart: WorkingChart, bound: float) -> None:
     moved = descend_on_patches(chart.piece.energy(density, None), density, chart.uv, chart.too_long, "auto")
     if moved is not None:
         chart.use(moved)
-
-
-def _fit_scale(piece: Piece, uv: FloatArray) -> FloatArray:
-    """Scale a map to the surface's area; if this inverts a triangle, scale exactly by a power of two."""
-    area = float(signed_areas(piece.F, in_units(uv, 0)).sum())
-    # The area of needles can be lost by rounding.
-    factor = np.sqrt(piece.area / area) if area > 0 else 1.0
-    scaled = (uv - uv.mean(axis=0)) * factor
-    return scaled if is_injective(piece.F, scaled) else np.ldexp(uv, round(np.log2(factor)))

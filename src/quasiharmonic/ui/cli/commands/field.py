@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from quasiharmonic.apps.displacement_fields.grid import FieldStep
     from quasiharmonic.io.fields import DisplacementField
+    from quasiharmonic.util.arrays import BoolArray
 
 
 def declare_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,7 +69,6 @@ def run(options: argparse.Namespace) -> int:
     """Read, make invertible, write, report."""
     from quasiharmonic.apps.displacement_fields.field_inversion import inverse_field
     from quasiharmonic.apps.displacement_fields.nearest import InvertibleField, fold_free, nearest_invertible
-    from quasiharmonic.apps.displacement_fields.voxels import describe_fixed
     from quasiharmonic.io.fields import field_suffix, read_field
     from quasiharmonic.util.outcome import as_plain
     from quasiharmonic.util.progress import report_to
@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
             raise ValueError(str(error)) from error
     if not repaired.success:
         fixed = (
-            "" if held is None or isinstance(repaired, InvertibleField) else describe_fixed(repaired.remaining, held)
+            "" if held is None or isinstance(repaired, InvertibleField) else _describe_fixed(repaired.remaining, held)
         )
         raise ValueError(f"no field without folds was found. {repaired.summary()}{fixed}")
     if options.interpolation != "linear":
@@ -159,3 +159,13 @@ def _border(field: NDArray[Any]) -> NDArray[np.bool_]:
     border = np.ones(field.shape[:-1], dtype=bool)
     border[(slice(1, -1),) * border.ndim] = False
     return border
+
+
+def _describe_fixed(remaining: BoolArray, fixed: BoolArray) -> str:
+    """Return a sentence on remaining cells (d − 1, h − 1, w − 1) whose eight voxels are all fixed; empty if none."""
+    from quasiharmonic.apps.displacement_fields.grid import find_fixed_cells, name_points
+
+    unrepairable = find_fixed_cells(remaining, fixed)
+    if not unrepairable.any():
+        return ""
+    return f" All eight voxels of some of these cells are fixed; the first of each is {name_points(unrepairable)}."
