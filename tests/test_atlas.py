@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from quasiharmonic import atlas, io
+from quasiharmonic import atlas, io, targets
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.geometry.exact.triangles import find_concave
 from quasiharmonic.surfaces import grid, starfish
@@ -416,6 +416,9 @@ class TestOutlines:
         np.testing.assert_allclose(boxes[1][0] - boxes[0][0], [2.1, 0], atol=1e-12)
         corner = boxes[1][0] + [boxes[1][1][0], 0]
         np.testing.assert_allclose(found.mesh.islands[2].uv[0], corner, atol=1e-12)
+        contours = targets.outline("rect:2x1")
+        again = atlas.injective_map(mesh, to=contours, corners={vertex: 1}, islands=[0, 2])
+        assert np.array_equal(again.mesh.uv, found.mesh.uv)
         for options, words in (({"fixed": [0], "to": "disk"}, "omit fixed or to"), ({"corners": "auto"}, "by to")):
             with pytest.raises(ValueError, match=words):
                 atlas.injective_map(mesh, **options)

@@ -225,3 +225,25 @@ def test_stop_keeps_the_best_certified_result(what):
     assert one.session.state is not before
     assert one.last("map").header["injective"]
     assert one.last("map").header["command"] == "qhm check start.obj"
+
+
+def test_stop_at_the_first_of_two_selected_islands(tmp_path):
+    V, F = grid(36, 12)
+    column = (3 * V[F].mean(axis=1)[:, 0]).astype(int)
+    FT = F + len(V) * column[:, None]
+    uv = np.concatenate([np.add(V, [2 * k, 0]) for k in range(3)])
+    made = list[Visitor]()
+
+    def stops():
+        return any("energy" in frame.header for one in made for frame in one.frames[opened:])
+
+    io.write_mapped(tmp_path / "model.obj", io.MeshData(np.pad(V, [(0, 0), (0, 1)]), F, vt=uv, FT=FT))
+    one = Visitor(tmp_path / "model.obj", waiting=stops, stops=stops)
+    one.does("select", islands=[0, 2])
+    before, opened = places(one), len(one.frames)
+    made.append(one)
+    one.does("outline", to="letter:C")
+    assert stops()
+    assert not [frame for frame in one.frames[opened:] if frame.header["kind"] == "note"]
+    assert one.last("map").header["injective"]
+    assert np.array_equal(places(one)[column > 0], before[column > 0])

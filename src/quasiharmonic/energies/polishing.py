@@ -278,6 +278,11 @@ def check_injective(domain: Domain, uv: ArrayLike, why: str) -> FloatArray:
     return array
 
 
+def is_smoothable(V: FloatArray, F: IntArray, *, slide: bool = False) -> bool:
+    """Return whether `smooth` changes maps of a surface."""
+    return (slide or len(F) <= LARGEST_SMOOTHED) and not rest_shapes(V, F).flat.size
+
+
 def smooth(
     problem: Problem,
     result: MapResult,
@@ -292,7 +297,7 @@ def smooth(
     triangle has no area. With ``slide``, maps of any size are smoothed, because only polishing slides the boundary. See
     `polish` for the options. If it is interrupted, the result is the best map so far with status ``INTERRUPTED``.
     """
-    if (len(problem.F) > LARGEST_SMOOTHED and slide is False) or rest_shapes(problem.V, problem.F).flat.size:
+    if not is_smoothable(problem.V, problem.F, slide=slide is not False):
         return result
     options = PolishOptions(
         energy="blend", max_iterations=SMOOTHING_STEPS, linear_solver=linear_solver, callback=callback, slide=slide

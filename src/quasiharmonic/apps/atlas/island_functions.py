@@ -163,7 +163,7 @@ def injective_map(
     mesh: SeamedMesh | MeshLike,
     *,
     fixed: ArrayLike | None = None,
-    to: str | os.PathLike[str] | None = None,
+    to: str | os.PathLike[str] | list[FloatArray] | None = None,
     corners: Mapping[int, int] | Literal["auto"] | None = None,
     reference: Any = None,
     islands: Collection[int] | None = None,
@@ -177,9 +177,9 @@ def injective_map(
     fixed : (k,) array of int, optional
     islands : collection of int, optional
         As for `polish`.
-    to : str or path, optional
-        Outline to which the boundaries are mapped, such as ``"letter:R"``: each island gets a copy beside the one
-        before. Holes of the outline are filled for an island without holes.
+    to : str, path, or list of (k, 2) arrays, optional
+        Outline to which the boundaries are mapped, such as ``"letter:R"``, or its contours: each island gets a copy
+        beside the one before. Holes of the outline are filled for an island without holes.
     corners : mapping of int to int or "auto", optional
         For ``to``: the number of the outline's corner for each of some vertices of the mesh, or corners by angle.
     reference, **rest
@@ -209,7 +209,8 @@ def injective_map(
         raise ValueError("corners need an outline: give one by to")
     if to is not None and checked is not None:
         raise ValueError("an outline fixes the boundary: omit fixed or to")
-    contours, copies = [] if to is None else outline(to), count()
+    contours = [] if to is None else to if isinstance(to, list) else outline(to)
+    copies = count()
     spec = None if corners is None else CornerSpec("auto" if corners == "auto" else tuple(corners.items()))
 
     def pose(island: Island) -> Problem:

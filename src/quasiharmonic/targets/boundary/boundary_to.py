@@ -344,10 +344,7 @@ def fit_boundary(
     copy, from the left; each of several islands has its own. Raises ValueError as `boundary_to` and `Problem`, or if a
     corner is not on the boundary.
     """
-    if beside:
-        # The outlines of several islands are 5 % of their width apart.
-        right = beside * (1 + 0.05) * float(np.ptp(np.concatenate(contours)[:, 0]))
-        contours = [contour + np.array([right, 0.0]) for contour in contours]
+    contours = place_beside(contours, beside)
     without_holes = filled(contours)
     holes = len(contours) - len(without_holes)
     try:
@@ -361,6 +358,14 @@ def fit_boundary(
     marked = find_corner_vertices(fixed, target, onto, corner_angle) if isinstance(chosen, str) else list(chosen or [])
     problem = Problem(V, F, fixed, target, reference=reference)
     return FittedProblem(problem, marked, holes if fills else 0)
+
+
+def place_beside(contours: Sequence[FloatArray], beside: int) -> list[FloatArray]:
+    """Return a copy of an outline, the one of index ``beside`` from the left; copies are 5 % of their width apart."""
+    if not beside:
+        return list(contours)
+    right = beside * (1 + 0.05) * float(np.ptp(np.concatenate(contours)[:, 0]))
+    return [contour + np.array([right, 0.0]) for contour in contours]
 
 
 def find_corner_vertices(

@@ -14,23 +14,20 @@ import numpy as np
 
 from quasiharmonic.apps.atlas import island_functions as atlas
 from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, mirrored_islands
-from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, MappedIsland, each_island
+from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, MappedIsland
 from quasiharmonic.apps.atlas.seam_cuts import cut_along, cut_apart
 from quasiharmonic.apps.uv_repair import repair
-from quasiharmonic.energies.polishing import LARGEST_SMOOTHED, SMOOTHING_STEPS, smooth
+from quasiharmonic.energies.polishing import SMOOTHING_STEPS, is_smoothable
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edges, trace_loops
 from quasiharmonic.io import MeshData, read_mesh
 from quasiharmonic.io.objects import as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
-from quasiharmonic.problem import Problem
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.solver.mapping import solve
 from quasiharmonic.targets import filled, outline_curves
-from quasiharmonic.targets.boundary.boundary_to import find_corner_vertices, fit_boundary, fix_in_place
-from quasiharmonic.targets.boundary.corner_pins import CornerSpec
+from quasiharmonic.targets.boundary.boundary_to import find_corner_vertices, place_beside
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.ui.studio import recipes
 from quasiharmonic.ui.studio.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Script, Source, public
@@ -40,7 +37,7 @@ from quasiharmonic.util.arrays import IntArray
 
 Callback = Callable[[Step], object] | None
 # Options of the smoothing after a search.
-_SMOOTHING = {"energy": "blend", "max_iterations": SMOOTHING_STEPS}
+_SMOOTHING: dict[str, Any] = {"energy": "blend", "max_iterations": SMOOTHING_STEPS}
 
 
 class Interrupted(KeyboardInterrupt):
@@ -87,34 +84,28 @@ def map_to_outline(
     ``corners`` are boundary vertices of the first selected island and the outline's corners that they go to. "auto"
     chooses vertices by angle; without corners arc length decides.
     """
-    only, posed = choose(state), list[tuple[Problem, list[int]]]()
+    only = choose(state)
     source = find_source(state, with_map=only is not None)
     own = state.active.island.vertices
     named = () if isinstance(corners, str) else tuple((int(own[v]), k) for v, k in corners)
-    spec = CornerSpec("auto" if isinstance(corners, str) else named) if corners else None
-    width = np.ptp(np.concatenate(outline.contours)[:, 0])
-
-    def lower(island: Island) -> MapResult:
-        asked = None if spec is None else spec.within(island.vertices)
-        copy = [contour + np.array([len(posed) * 1.05 * width, 0.0]) for contour in outline.contours]
-        fitted = fit_boundary(island.V, island.F, copy, corners=asked)
-        problem, onto = fitted.problem, filled(copy) if fitted.filled_holes else copy
-        posed.append((problem, find_corner_vertices(problem.fixed, problem.target, onto)))
-        return solve_smoothly(problem, callback)
-
-    mapped = each_island(state.mesh, lower, reflect=False, only=only)
     word = corners if corners == "auto" else ",".join(f"{v}:{k}" for v, k in named) or None
     chosen: dict[int, int] | str = corners if isinstance(corners, str) else dict(named)
     options = {
-        "to": Given(outline, outline.to, {"to": outline.to}, outline.texts),
+        "to": Given(outline.contours, outline.to, {"to": outline.to}, outline.texts),
         "corners": Given(chosen, chosen, {"corners": word}) if chosen else None,
     }
-    recipe = _record_map(source, mapped, options, {}, only)
-    after = rebuild(state, mapped, replace(recipe, outline=outline.to))
-    for i, (k, (problem, found)) in enumerate(zip(state.selected, posed, strict=True)):
-        by_angle, given = corners == "auto", () if isinstance(corners, str) or i else tuple(corners)
-        one = replace(after.islands[k], outline=outline, corners=tuple(found), chosen=given, by_angle=by_angle)
-        after = after.with_island(k, one.with_problem(problem))
+    mapped, recipe = _map(state.mesh, source, options, {}, only, callback)
+    after = _diagnose_selected(rebuild(state, mapped, replace(recipe, outline=outline.to)))
+    for i, k in enumerate(state.selected):
+        one, by_angle = after.islands[k], corners == "auto"
+        copy = place_beside(outline.contours, i)
+        onto = filled(copy) if len(one.loops) == 1 else copy
+        assert one.fixed is not None
+        assert one.target is not None
+        given = () if i or isinstance(corners, str) else tuple(corners)
+        found = tuple(find_corner_vertices(one.fixed, one.target, onto))
+        one = replace(one, outline=outline, corners=found, chosen=given, by_angle=by_angle)
+        after = after.with_island(k, one)
     return after
 
 
@@ -126,39 +117,61 @@ def map_in_place(
     With ``follows``, ``start`` is injective. It is then improved if the search from scratch finds no map.
     """
     source = find_source(state, with_map=True) if start is state.mesh else make_start(start)
-    fixed = _list_fixed(state, only)
-    numbers = None if fixed is None else fixed.value
-
-    def lower(island: Island) -> MapResult:
-        return solve_smoothly(fix_in_place(island, numbers).problem, callback)
-
-    mapped = each_island(start, lower, only=only)
+    fixed = {"fixed": _list_fixed(state, only)}
+    mapped, recipe = _map(start, source, fixed, fixed, only, callback)
     done = mapped.islands if only is None else [mapped.islands[k] for k in only]
-    anew = all(one.result.injective for one in done)
-    if anew or not follows:
-        recipe = _record_map(source, mapped, {"fixed": fixed}, {"fixed": fixed}, only)
-    else:
-        options = {**_SMOOTHING, "fixed": fixed}
-        mapped, recipe = recipes.perform(atlas.polish, start, source, "again.obj", options, only, callback)
+    anew = not follows or all(one.result.injective for one in done)
+    if not anew:
+        mapped, recipe = recipes.perform(atlas.polish, start, source, "again.obj", _SMOOTHING | fixed, only, callback)
     recipe = replace(recipe, anew=anew, dragged=start is not state.mesh)
-    return rebuild(state, mapped, recipe, keep=("pins", "corners"))
+    return _diagnose_selected(rebuild(state, mapped, recipe, keep=("pins", "corners")))
 
 
-def _record_map(
-    source: Source, mapped: MappedAtlas, options: dict[str, Any], held: dict[str, Any], only: list[int] | None
-) -> Recipe:
-    """Return the recipe of a search for maps with ``options``; small injective maps are smoothed then.
+def _map(
+    start: SeamedMesh,
+    source: Source,
+    options: dict[str, Any],
+    held: dict[str, Any],
+    only: list[int] | None,
+    callback: Callback,
+) -> tuple[MappedAtlas, Recipe]:
+    """Search for maps with ``options`` and smooth small injective ones, as ``qhm map`` does.
 
-    ``held`` are the options of the smoothing that fix vertices.
+    ``held`` are the options of the smoothing that fix vertices. Raise Interrupted after an interrupt.
     """
-    script, chosen = Script(), list(range(len(mapped.islands))) if only is None else only
+    script = Script()
     mesh = script.let("mesh", public(atlas.injective_map)(source.name, **options, islands=only).mesh)
-    found = [mapped.islands[k] for k in chosen]
-    small = [one.result.injective and len(one.triangles) <= LARGEST_SMOOTHED for one in found]
-    if any(small):
-        some = only if all(small) else [k for k, smoothed in zip(chosen, small, strict=True) if smoothed]
-        script.let("mesh", public(atlas.polish)(mesh, **held, **_SMOOTHING, islands=some).mesh)
-    return recipes.record_call("map", source, "again.obj", options, script, only)
+    mapped = atlas.injective_map(start, islands=only, callback=callback, **recipes.values(options))
+    _check_finished(mapped)
+    chosen = range(len(mapped.islands)) if only is None else only
+    some = [k for k in chosen if _can_be_smoothed(mapped, k)]
+    if some:
+        again = only if len(some) == len(chosen) else some
+        script.let("mesh", public(atlas.polish)(mesh, **held, **_SMOOTHING, islands=again).mesh)
+        smoothed = atlas.polish(mapped.mesh, **recipes.values(held), **_SMOOTHING, islands=again, callback=callback)
+        _check_finished(smoothed)
+        islands = [*mapped.islands]
+        for k in some:
+            # Convergence is not the goal here, so the status does not report its absence.
+            result = smoothed.islands[k].result.after(islands[k].result)
+            islands[k] = replace(smoothed.islands[k], result=replace(result, status=Status.INJECTIVE))
+        mapped = MappedAtlas(smoothed.mesh, tuple(islands))
+    return mapped, recipes.record_call("map", source, "again.obj", options, script, only)
+
+
+def _diagnose_selected(state: SessionState) -> SessionState:
+    """Return the state with a diagnosis of the selected islands whose map is not bijective."""
+    for k in state.selected:
+        one = state.islands[k]
+        if one.result is not None and not one.result.certificate.bijective and one.result.diagnosis is None:
+            found = replace(one.result, diagnosis=diagnose(one.problem))
+            state = state.with_island(k, replace(one, result=found).with_problem(one.problem))
+    return state
+
+
+def _can_be_smoothed(mapped: MappedAtlas, k: int) -> bool:
+    """Whether an island has an injective map that `smooth` would change."""
+    return mapped.islands[k].result.injective and is_smoothable(mapped.mesh.islands[k].V, mapped.mesh.islands[k].F)
 
 
 def polish_islands(state: SessionState, energy: str, slide: bool, callback: Callback = None) -> SessionState:
@@ -227,15 +240,10 @@ def is_flattenable(island: Island) -> bool:
     return loops > 0 and n - len(found.interior) - len(found.boundary) + len(island.F) == 2 - loops
 
 
-def solve_smoothly(problem: Problem, callback: Callback) -> MapResult:
-    """Solve a problem as ``qhm map`` does; the result has a diagnosis if no bijective map was found."""
-    result = solve(problem, max_iterations=2000, callback=callback)
-    if result.status is Status.INJECTIVE:
-        result = smooth(problem, result, callback=callback)
-    interrupted = result.status is Status.INTERRUPTED
-    if not interrupted and not result.certificate.bijective and result.diagnosis is None:
-        result = replace(result, diagnosis=diagnose(problem))
-    return result
+def _check_finished(mapped: MappedAtlas) -> None:
+    """Raise Interrupted if a step has been interrupted."""
+    if any(one.result.status is Status.INTERRUPTED for one in mapped.islands):
+        raise Interrupted(mapped.mesh)
 
 
 def rebuild(state: SessionState, mapped: MappedAtlas, recipe: Recipe, keep: Collection[str] = ()) -> SessionState:
@@ -243,8 +251,7 @@ def rebuild(state: SessionState, mapped: MappedAtlas, recipe: Recipe, keep: Coll
 
     Islands that were not selected and have not moved are unchanged. All islands are selected if their number changes.
     """
-    if any(one.result.status is Status.INTERRUPTED for one in mapped.islands):
-        raise Interrupted(mapped.mesh)
+    _check_finished(mapped)
     selected = state.selected if len(mapped.islands) == len(state.islands) else tuple(range(len(mapped.islands)))
     islands = []
     for k, (island, one) in enumerate(zip(mapped.mesh.islands, mapped.islands, strict=True)):
