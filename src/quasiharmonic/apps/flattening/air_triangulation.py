@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,23 +32,31 @@ from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.geometry.exact.constrained_delaunay import BlockedError, constrained_delaunay, select_inside
 from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, names_of, to_complex
 
-# Maximum number of times that squares are halved.
-_DEEPEST = 40
+
+class AirTuning(NamedTuple):
+    """Numbers that tune the triangulation around a boundary."""
+
+    # Maximum number of times that squares are halved.
+    deepest: int = 40
+    # Side of a square of the tree, relative to the length of an edge in it.
+    spacing: float = 1.4
+    # Minimum distance of inner points to the boundary, relative to their square's side.
+    clearance: float = 0.55
+    # The frame's sides are bent outwards by this fraction of their length, so that corners of the hull are strictly
+    # convex.
+    bulge: float = 0.05
+    # Number of the tree's largest squares along the longer side of the frame.
+    largest_squares: int = 8
+    smoothings: int = 3
+    # Smoothing may reduce shape qualities above this; 1 is an equilateral triangle.
+    good: float = 0.5
+
+
+_TUNING = AirTuning()
 # A square is encoded as one integer with this number of bits per coordinate.
 _BITS = 31
 _BESIDE = (0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)
-# Side of a square of the tree, relative to the length of an edge in it.
-_SPACING = 1.4
-# Minimum distance of inner points to the boundary, relative to their square's side.
-_CLEARANCE = 0.55
-# The frame's sides are bent outwards by this fraction of their length, so that corners of the hull are strictly convex.
-_BULGE = 0.05
-# Number of the tree's largest squares along the longer side of the frame.
-_LARGEST_SQUARES = 8
-_SMOOTHINGS = 3
 _MEETS_ITSELF = "the boundary meets itself, so the air around it cannot be meshed: certify(F, uv) lists where"
-# Smoothing may reduce shape qualities above this; 1 is an equilateral triangle.
-_GOOD = 0.5
 
 
 @dataclass(frozen=True)
@@ -65,7 +74,7 @@ class Quadtree:
     ) -> Quadtree:
         """Split until squares at given positions (k, 2) have at most given sizes (k,)."""
         # The depth is limited by the integers; smaller sizes get squares that are too large.
-        deepest = min(_DEEPEST, _BITS - 1 - int(np.ceil(np.log2(max(shape)))))
+        deepest = min(_TUNING.deepest, _BITS - 1 - int(np.ceil(np.log2(max(shape)))))
         with np.errstate(divide="ignore"):
             level = np.clip(np.ceil(np.log2(side / sizes)), 0, deepest).astype(np.int64)
         split: list[IntArray] = []
@@ -177,7 +186,7 @@ def _cover(points: FloatArray, margin: float) -> _Squares:
     """Corner, side and numbers of the squares that cover the points' bounding box and a margin around it."""
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     longer = float(extent.max())
-    side = (1 + 2 * margin) * longer / _LARGEST_SQUARES
+    side = (1 + 2 * margin) * longer / _TUNING.largest_squares
     across = np.ceil((extent + 2 * margin * longer) / side - 1e-9)
     return low + (extent - side * across) / 2, side, (int(across[0]), int(across[1]))
 
@@ -193,7 +202,7 @@ def _frame(corner: FloatArray, side: float, shape: tuple[int, int]) -> FloatArra
         ((0.0, height), (0.0, -height), (-1, 0), shape[1]),
     ):
         t = (np.arange(count) / count)[:, None]
-        bulge = 4 * _BULGE * np.hypot(*along) * t * (1 - t)
+        bulge = 4 * _TUNING.bulge * np.hypot(*along) * t * (1 - t)
         frame.append(corner + start + t * np.array(along) + bulge * np.array(outward))
     return np.concatenate(frame)
 
@@ -203,7 +212,7 @@ def _inner_points(tails: FloatArray, heads: FloatArray, squares: _Squares) -> Fl
     from scipy.spatial import KDTree
 
     lengths = np.hypot(*(heads - tails).T)
-    asked = _SPACING * np.concatenate([lengths, lengths])
+    asked = _TUNING.spacing * np.concatenate([lengths, lengths])
     tree = Quadtree.around(np.concatenate([(tails + heads) / 2, tails]), asked, *squares)
     points, sizes = tree.points()
     # Edges are cut into pieces of at most half their squares' sides, so that the nearest centre gives the nearest
@@ -220,7 +229,7 @@ def _inner_points(tails: FloatArray, heads: FloatArray, squares: _Squares) -> Fl
     nearest = KDTree((p + q) / 2).query(points)[1]
     at, start, end = (in_units(positions, 0) for positions in (points, p[nearest], q[nearest]))
     outside = ((end - start).conj() * (at - start)).imag < 0
-    return points[outside & (nearest_on_edges(at, start, end)[0] > _CLEARANCE * sizes)]
+    return points[outside & (nearest_on_edges(at, start, end)[0] > _TUNING.clearance * sizes)]
 
 
 def _triangulate(
@@ -247,14 +256,14 @@ def _smooth_points(points: FloatArray, triangles: IntArray, held: int) -> FloatA
     tails, heads = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     count = np.maximum(np.bincount(tails, minlength=n), 1)
     best, shape = points, _shapes(points, triangles)
-    for _ in range(_SMOOTHINGS):
+    for _ in range(_TUNING.smoothings):
         middle = np.stack([np.bincount(tails, best[heads, k], minlength=n) / count for k in range(2)], axis=1)
         moved = best.copy()
         moved[held:] = middle[held:]
         idle = np.zeros(n, dtype=bool)
         while True:
             after = _shapes(moved, triangles)
-            worse = after < np.minimum(shape, _GOOD)
+            worse = after < np.minimum(shape, _TUNING.good)
             back = triangles[worse].ravel()
             back = back[~idle[back]]
             back = back[back >= held]

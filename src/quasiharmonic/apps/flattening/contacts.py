@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,14 +31,22 @@ from quasiharmonic.geometry.exact.loops import check_loops, contacts
 from quasiharmonic.geometry.exact.predicates import box_pairs_between
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, sum_at, to_complex, to_points
 
-# Reach of the barrier, relative to the local edge length of the boundary.
-_REACH = 1.0
-# Pairs up to this many times the reach are also tracked during a step, which may bring them closer.
-_LOOKOUT = 2.0
-_MAX_MEETINGS = 1000
-# Small overlaps have less than this number of pairs of edges. Their vertices move by these fractions of the smallest
-# height of their triangles, tried in turn.
-_MAX_PULLED = 10_000
+
+class ContactTuning(NamedTuple):
+    """Numbers that tune the barrier, and the pulling apart of small overlaps."""
+
+    # Reach of the barrier, relative to the local edge length of the boundary.
+    reach: float = 1.0
+    # Pairs up to this many times the reach are also tracked during a step, which may bring them closer.
+    lookout: float = 2.0
+    # Maximum number of pairs of edges that are tracked.
+    max_tracked: int = 1000
+    # Small overlaps have less than this number of pairs of edges.
+    max_pulled: int = 10_000
+
+
+_TUNING = ContactTuning()
+# Vertices of small overlaps move by these fractions of the smallest height of their triangles, tried in turn.
 _SHARES = 0.0, *(1e-6 * 2.0**k for k in range(20))
 #: Half the gradients of the hat functions of a triangle v, a, b with a right angle at a and legs of length 1.
 HATS = np.array([0.5, -0.5 - 0.5j, 0.5j])
@@ -157,7 +166,7 @@ class Rim:
         """Return the end vertices (k,) of the first 1,000 pairs of intersecting boundary edges."""
         tail, head = uv[self._edges[:, 0]], uv[self._edges[:, 1]]
         short = self._edges[(tail == head).all(axis=1)]
-        pairs = contacts(uv, self._edges, _MAX_MEETINGS).pairs
+        pairs = contacts(uv, self._edges, _TUNING.max_tracked).pairs
         return np.unique(np.concatenate([short.ravel(), self._edges[pairs].ravel()]))
 
     def tangled_fraction(self, uv: FloatArray) -> float:
@@ -179,10 +188,10 @@ class Rim:
         inward[self._vertex] = ahead / np.abs(ahead) * np.exp(1j * halfway)
         inward *= smallest_heights(w, F)
         tried, moved = np.zeros(w.size, dtype=np.int64), uv
-        while (pairs := contacts(moved, self._edges, _MAX_PULLED).pairs).size:
+        while (pairs := contacts(moved, self._edges, _TUNING.max_pulled).pairs).size:
             met = np.unique(self._edges[pairs])
             tried[met] += 1
-            if len(pairs) == _MAX_PULLED or tried.max() == len(_SHARES):
+            if len(pairs) == _TUNING.max_pulled or tried.max() == len(_SHARES):
                 return None
             moved = to_points(w + np.take(_SHARES, tried) * inward)
         return moved if is_injective(F, moved) and not self.meets_itself(moved) else None
@@ -194,14 +203,14 @@ class Rim:
         length = np.abs(q - p)
         around = 0.5 * (length + length[self._previous])
         # Most candidates are the vertex's own and neighbouring edges, so they are removed first.
-        radius = (_LOOKOUT * _REACH * around)[:, None]
+        radius = (_TUNING.lookout * _TUNING.reach * around)[:, None]
         here, there = to_points(p), to_points(q)
         boxes = here - radius, here + radius, np.minimum(here, there), np.maximum(here, there)
         found = [self._exclude_own_edges(*pairs) for pairs in box_pairs_between(*boxes)]
         i, j = np.concatenate(found, axis=1) if found else np.zeros((2, 0), dtype=np.int64)
-        reach = _REACH * np.minimum(around[i], length[j])
+        reach = _TUNING.reach * np.minimum(around[i], length[j])
         d, normal, s = nearest_on_edges(p[i], p[j], q[j])
-        near = np.flatnonzero(d < _LOOKOUT * reach)
+        near = np.flatnonzero(d < _TUNING.lookout * reach)
         i, j, reach, normal, s = i[near], j[near], reach[near], normal[near], s[near]
         # The path from the vertex to the edge must lie outside the surface at both ends,
         head = self._next[j]

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,26 +37,34 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, invert_indices, mark, to_points
 
-# Weight that keeps the affine map close to a similarity.
-_RIGID = 1e-2
-# The affine position is used if every triangle has at least this fraction of its area in the flat layout.
-_MIN_AREA_SHARE = 0.05
-# Maximum sum of the angles around a boundary vertex when its ring is laid out.
-_WIDEST = 1.9 * np.pi
-# Below this mean energy a map has little distortion.
-_LITTLE = 1.0
+
+class LevelTuning(NamedTuple):
+    """Numbers that tune maps by way of coarse meshes."""
+
+    # Weight that keeps the affine map close to a similarity.
+    rigid: float = 1e-2
+    # The affine position is used if every triangle has at least this fraction of its area in the flat layout.
+    min_area_share: float = 0.05
+    # Maximum sum of the angles around a boundary vertex when its ring is laid out.
+    widest: float = 1.9 * np.pi
+    # Below this mean energy a map has little distortion.
+    little: float = 1.0
+    # Tolerance on coarse meshes, whose maps are only starts.
+    tolerance: float = 1e-1
+    # From this height of ears on, all boundary vertices are placed inside the coarse image, not only those at
+    # intersections.
+    late: float = 1e-3
+
+
+_TUNING = LevelTuning()
+# Heights of ears above their edges, relative to the edges; tried in turn until the map is bijective.
+_HEIGHTS = tuple(0.3 * 4.0**-k for k in range(18))
 #: Number of vertices of the coarsest mesh.
 COARSEST = 150
 #: Minimum ratio between the vertex counts of successive meshes.
 RATIO = 4.0
-# Tolerance on coarse meshes, whose maps are only starts.
-_TOLERANCE = 1e-1
 #: Maximum number of steps on the coarsest mesh, and on the others.
 STEPS = (300, 40)
-# Heights of ears above their edges, relative to the edges; tried in turn until the map is bijective.
-_HEIGHTS = tuple(0.3 * 4.0**-k for k in range(18))
-# From this height on, all boundary vertices are placed inside the coarse image, not only those at intersections.
-_LATE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +215,7 @@ class Hierarchy:
         if rim:
             angle = angle[:, :-1]
         total = angle.sum(axis=1)
-        wanted = np.minimum(total, _WIDEST) if rim else np.full(total.shape, 2 * np.pi)
+        wanted = np.minimum(total, _TUNING.widest) if rim else np.full(total.shape, 2 * np.pi)
         angle = angle * (wanted / np.where(total > 0, total, 1))[:, None]
         turned = np.zeros(ring.shape)
         turned[:, 1:] = np.cumsum(angle if rim else angle[:, :-1], axis=1)
@@ -223,7 +232,7 @@ def _fit_affine(flat: ComplexArray, around: ComplexArray) -> ComplexArray:
     # The normal equations of arm ≈ c + a·flat + b·conj(flat), from which a and b are eliminated.
     first, second = weighted.sum(axis=1), (weighted * flat).sum(axis=1)
     size = (weighted * flat.conj()).real.sum(axis=1)
-    of_a, of_b = size + 1e-12 * scale, size + _RIGID * scale
+    of_a, of_b = size + 1e-12 * scale, size + _TUNING.rigid * scale
     determinant = of_a * of_b - np.abs(second) ** 2
     a = (first * of_b - first.conj() * second) / determinant
     b = (first.conj() * of_a - first * second.conj()) / determinant
@@ -243,7 +252,7 @@ def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, 
     longest = np.maximum(np.maximum(np.abs(then), np.abs(following)), np.abs(following - then))[:, :last]
     rest = np.maximum(rest, LOWEST * longest**2)
     scale = area.sum(axis=1) / rest.sum(axis=1)
-    least = np.maximum(_MIN_AREA_SHARE * scale[:, None] * rest, 0)
+    least = np.maximum(_TUNING.min_area_share * scale[:, None] * rest, 0)
     good: BoolArray = (area > least).all(axis=1)
     return good
 
@@ -310,8 +319,8 @@ def prolong_map(
         met = rim.meetings(uv)
         if not met.size and is_injective(there.F, uv):
             return smooth_map(hierarchy.V[there.vertices], there.F, there.loops, uv, linear_solver)
-        # Boundary vertices at intersections are placed inside the coarse image, and from _LATE on all of them.
-        late = height < _LATE
+        # Boundary vertices at intersections are placed inside the coarse image, and from `late` on all of them.
+        late = height < _TUNING.late
         kept_inside[there.vertices if late else there.vertices[met]] = True
     return None
 
@@ -329,7 +338,7 @@ def descend_level(
 
     def lower(rim: Rim | None) -> FloatArray:
         descent = SurfaceDescent(energy, uv, linear_solver, rim=rim, iterate=True)
-        for _ in islice(descend(descent, SymmetricDirichlet(), _TOLERANCE), steps):
+        for _ in islice(descend(descent, SymmetricDirichlet(), _TUNING.tolerance), steps):
             pass
         return descent.uv
 
@@ -338,7 +347,7 @@ def descend_level(
         apart = rim.pull_apart(level.F, free) if rim.meets_itself(free) else free
         if apart is not None:
             return apart, False
-        guarded = energy.value(in_units(free, 0)) > _LITTLE
+        guarded = energy.value(in_units(free, 0)) > _TUNING.little
     energy.energy = SymmetricDirichlet()
     return lower(rim), guarded
 

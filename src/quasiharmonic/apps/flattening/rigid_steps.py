@@ -35,24 +35,31 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.solver.methods.relocation import relocate
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, sum_at, to_points
 
-# Maximum ratio between the vertex counts of the surface and of the coarse mesh.
-_RATIO = 50.0
-# Rigid steps are tried if the coarse map's mean energy is at most this. Coarse maps of sheets have 0.05 to 0.3, due to
-# thin coarse triangles.
-_MAX_COARSE_ENERGY = 0.5
-# Maximum mean energy of their result.
-_MAX_ENERGY = 1.0
-_MAX_STEPS = 10
-# Steps continue as long as they lower the energy to at most this fraction.
-_USEFUL = 0.5
-# Up to this number of inverted triangles, their vertices inside the surface are moved to make them positive.
-_FEW_INVERTED = 100
-# Triangles with a larger ratio between their singular values do not determine their rotations, their neighbours do.
-_SHEARED = 4.0
+
+class RigidTuning(NamedTuple):
+    """Numbers that tune rigid steps."""
+
+    # Maximum ratio between the vertex counts of the surface and of the coarse mesh.
+    ratio: float = 50.0
+    # Rigid steps are tried if the coarse map's mean energy is at most this. Coarse maps of sheets have 0.05 to 0.3, due
+    # to thin coarse triangles.
+    max_coarse_energy: float = 0.5
+    # Maximum mean energy of their result.
+    max_energy: float = 1.0
+    max_steps: int = 10
+    # Steps continue as long as they lower the energy to at most this fraction.
+    useful: float = 0.5
+    # Up to this number of inverted triangles, their vertices inside the surface are moved to make them positive.
+    few_inverted: int = 100
+    # Triangles with a larger ratio between their singular values do not determine their rotations, their neighbours do.
+    sheared: float = 4.0
+    # Height of ears, as in `Hierarchy.prolong`.
+    height: float = 0.3
+
+
+_TUNING = RigidTuning()
 #: Number of triangles from which `find_almost_isometry` saves time.
 ALMOST_FROM = 30_000
-# Height of ears, as in `Hierarchy.prolong`.
-_HEIGHT = 0.3
 
 
 class AlmostIsometry(NamedTuple):
@@ -90,7 +97,7 @@ def _prolong_coarse_map(
     Triangles may be inverted.
     """
     hierarchy = Hierarchy(V, F, list(loops), COARSEST)
-    coarse = hierarchy.coarsest(len(V) / _RATIO)
+    coarse = hierarchy.coarsest(len(V) / _TUNING.ratio)
     stops = [*(stop for stop in hierarchy.select_stops(RATIO) if stop > coarse), coarse]
     uv = flatten_levels(hierarchy, stops, linear_solver)
     if uv is None:
@@ -98,11 +105,11 @@ def _prolong_coarse_map(
     level = hierarchy.level(coarse)
     V_coarse = V[level.vertices]
     uv, _ = descend_level(V_coarse, level, uv, linear_solver, False, STEPS[1])
-    if thick_energy(V_coarse, level.F).value(in_units(uv, 0)) > _MAX_COARSE_ENERGY:
+    if thick_energy(V_coarse, level.F).value(in_units(uv, 0)) > _TUNING.max_coarse_energy:
         return None
     w = np.zeros(len(V), dtype=np.complex128)
     w[level.vertices] = in_units(uv, 0)
-    return hierarchy.prolong(w, coarse, 0, np.zeros(len(V), dtype=bool), _HEIGHT)
+    return hierarchy.prolong(w, coarse, 0, np.zeros(len(V), dtype=bool), _TUNING.height)
 
 
 def _take_rigid_steps(
@@ -113,7 +120,7 @@ def _take_rigid_steps(
     ``rim`` (k,) are the boundary vertices.
     """
     found, least, d = None, np.inf, energy.deform(w)
-    for _ in range(_MAX_STEPS):
+    for _ in range(_TUNING.max_steps):
         with np.errstate(all="ignore"):
             try:
                 w = rotations.turn(w, d, _rotations(V, energy.F, d))
@@ -121,23 +128,23 @@ def _take_rigid_steps(
                 break
             d = energy.deform(w)
             inverted = int(np.count_nonzero(~(np.abs(d.p) > np.abs(d.q))))
-            if 0 < inverted <= _FEW_INVERTED and (moved := relocate(energy.F, w, rim)) is not None:
+            if 0 < inverted <= _TUNING.few_inverted and (moved := relocate(energy.F, w, rim)) is not None:
                 w, d, inverted = moved, energy.deform(moved), 0
             value = energy.value_of(d)
         if not inverted and is_injective(energy.F, to_points(w)):
-            useful = value <= _USEFUL * least
+            useful = value <= _TUNING.useful * least
             if value < least:
                 found, least = w, value
             if not useful:
                 break
-    return to_points(found) if found is not None and least < _MAX_ENERGY else None
+    return to_points(found) if found is not None and least < _TUNING.max_energy else None
 
 
 def _rotations(V: FloatArray, F: IntArray, d: Deformation) -> ComplexArray:
     """Rotations (f,) of triangles; sheared ones, and some rings around inverted ones, follow their neighbours."""
     p, q = np.abs(d.p), np.abs(d.q)
     turned = np.where(p > 0, d.p / p, 1)
-    bad = ~(p + q < _SHEARED * (p - q))
+    bad = ~(p + q < _TUNING.sheared * (p - q))
     if not bad.any():
         return turned
     bad |= has_marked_corner(F, mark_around(F, ~(p > q), len(V)))

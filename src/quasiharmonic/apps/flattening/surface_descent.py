@@ -24,24 +24,31 @@ from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
-# Stages of a guarded descent: the weight of each contact, relative to the surface's mean energy per triangle, and a
-# factor on the tolerance. Early stages stop sooner, as they only prepare the later ones.
-_STAGES = (1e-2, 30.0), (1e-3, 5.0), (1e-4, 1.0)
-# The system's sparsity pattern is rebuilt when this fraction of the repelling contacts is not in it.
-_MAX_UNCOUPLED = 0.3
-# Lower bound of the energy for the contacts' weight.
-_MIN_ENERGY = 1e-4
-# A step may reduce the smallest gap to this fraction of its old value, or of its reach.
-_NARROWER = 0.3
-# Full Newton steps converge quadratically. A slow step leaves more than the first fraction of the decrement, and more
-# than the second one of the energy.
-_SLOW_DECREMENT = 0.3
-_SLOW_ENERGY = 0.8
-# Number of slow steps in a row after which rotating triangles probably limit straight steps.
-_SLOW_STEPS = 4
-# Minimum ratio of median rotation to median growth of such triangles. Below it a straight step is as good, and needs no
-# solve.
-_TURNED = 12.0
+
+class GuardTuning(NamedTuple):
+    """Numbers that tune descents with a guarded boundary, and slow steps."""
+
+    # Stages of a guarded descent: the weight of each contact, relative to the surface's mean energy per triangle, and a
+    # factor on the tolerance. Early stages stop sooner, as they only prepare the later ones.
+    stages: tuple[tuple[float, float], ...] = ((1e-2, 30.0), (1e-3, 5.0), (1e-4, 1.0))
+    # The system's sparsity pattern is rebuilt when this fraction of the repelling contacts is not in it.
+    max_uncoupled: float = 0.3
+    # Lower bound of the energy for the contacts' weight.
+    min_energy: float = 1e-4
+    # A step may reduce the smallest gap to this fraction of its old value, or of its reach.
+    narrower: float = 0.3
+    # Full Newton steps converge quadratically. A slow step leaves more than the first fraction of the decrement, and
+    # more than the second one of the energy.
+    slow_decrement: float = 0.3
+    slow_energy: float = 0.8
+    # Number of slow steps in a row after which rotating triangles probably limit straight steps.
+    slow_steps: int = 4
+    # Minimum ratio of median rotation to median growth of such triangles. Below it a straight step is as good, and
+    # needs no solve.
+    turned: float = 12.0
+
+
+_TUNING = GuardTuning()
 #: Below this mean energy Newton steps converge faster than those of `ReweightedDirichlet`.
 NEAR_ENERGY = 0.1
 
@@ -164,11 +171,12 @@ class SurfaceModel(MapModel):
     ) -> tuple[NewtonState, bool] | None:
         """See `NewtonModel`; after several slow full steps, first try a path along which triangles rotate."""
         course: _StepRecord = state.extra
-        less = expected_decrease > _SLOW_DECREMENT * course.decrease and state.value > _SLOW_ENERGY * course.value
+        less = expected_decrease > _TUNING.slow_decrement * course.decrease
+        less = less and state.value > _TUNING.slow_energy * course.value
         slow = course.slow + 1 if less and not shortened else 0
         state = state._replace(extra=course._replace(decrease=expected_decrease, value=state.value, slow=slow))
         full = self.displacement(direction, state.w.size)
-        if slow >= _SLOW_STEPS:
+        if slow >= _TUNING.slow_steps:
             rotated = self._search_rotating(state, full, expected_decrease)
             if rotated is not None:
                 return rotated, False
@@ -185,7 +193,7 @@ class SurfaceModel(MapModel):
     def _search_rotating(self, state: NewtonState, full: ComplexArray, expected_decrease: float) -> NewtonState | None:
         """Take a full or longer step along a rotating path; None if the energy does not decrease enough."""
         rate = rates(self.surface.F, self.surface.g, state.w, full)
-        rotates = np.median(np.abs(rate.imag)) > _TURNED * np.median(np.abs(rate.real))
+        rotates = np.median(np.abs(rate.imag)) > _TUNING.turned * np.median(np.abs(rate.real))
         if not rotates or self._rotation_path is None:
             return None
         path = self._rotation_path.path(state.w, full)
@@ -227,7 +235,7 @@ class GuardedModel(SurfaceModel):
     ) -> None:
         super().__init__(GuardedEnergy(surface), uv, linear_solver, fixed, pairs, surface)
         self._rim = rim
-        self._stages = iter(_STAGES)
+        self._stages = iter(_TUNING.stages)
         self._weight, self.slack = next(self._stages)
         self._known = RimContacts.none().corners
 
@@ -250,14 +258,14 @@ class GuardedModel(SurfaceModel):
         energy, near, n = self.energy, state.extra.near, state.w.size
         known, uncoupled = near.split(self._known, n)
         repelling = near.within(state.w, 1.0).reach.size
-        if uncoupled.within(state.w, 1.0).reach.size > _MAX_UNCOUPLED * repelling:
+        if uncoupled.within(state.w, 1.0).reach.size > _TUNING.max_uncoupled * repelling:
             # The new pattern includes possible and earlier contacts, so that it lasts for several steps.
             self._known = _unite_pairs(self._known, near.corners, n)
             g = np.concatenate([energy.g, np.repeat(HATS[:, None], len(self._known.T), axis=1)], axis=1)
             self.system = NewtonSystem(np.concatenate([energy.F, self._known.T]), g, *self._for_systems)
             known, uncoupled = near.split(self._known, n)
         energy.contacts, energy.uncoupled = known, uncoupled
-        energy.stiffness = self._weight * max(self.distortion(state), _MIN_ENERGY) / len(energy.F)
+        energy.stiffness = self._weight * max(self.distortion(state), _TUNING.min_energy) / len(energy.F)
         return state._replace(value=energy.value_of(state.derivatives))
 
     def assemble(self, state: NewtonState, negative: float) -> None:
@@ -279,9 +287,9 @@ class GuardedModel(SurfaceModel):
             return value, None
         near = self._rim.contacts(w)
         gap = near.smallest_gap(w)
-        # New pairs are compared with _NARROWER at most, as otherwise no step might be short enough.
-        before = min(state.extra.gap, near.smallest_gap(state.w), _NARROWER)
-        if gap < _NARROWER * before or self._rim.meets_itself(self.positions(w)):
+        # New pairs are compared with `narrower` at most, as otherwise no step might be short enough.
+        before = min(state.extra.gap, near.smallest_gap(state.w), _TUNING.narrower)
+        if gap < _TUNING.narrower * before or self._rim.meets_itself(self.positions(w)):
             return value, None
         return value, there._replace(extra=there.extra._replace(near=near, gap=gap))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,19 +35,28 @@ WORST_STRETCH = 3.0
 THIN_ANGLE = np.pi / 180
 #: Share of the area that may be stretched beyond the bound.
 FREE_SHARE = 0.01
-# Relative tolerance of the descents: a more accurate minimum hardly changes the stretch.
-_TOLERANCE = 1e-2
-_MAX_STEPS = 100
-# A descent ends after a step that lowers the energy by less than this share: further steps change the stretch little.
-_SLOW = 0.05
-# A mean energy below this needs no further steps.
-_NOTHING = 1e-5
-# Smallest energy at the bound that `EvenStretch` uses.
-_LEAST_ENERGY = 0.1
-# From mean energies below this, Newton steps are used directly.
-_NEAR = 1.0
-# Boundary vertices are rounded to this multiple of the root of the area before contacts are sought.
-_GAP = 2.0**-20
+
+
+class ChartTuning(NamedTuple):
+    """Numbers that tune the descents of charts. Energies are means over the surface."""
+
+    # Relative tolerance of the descents: a more accurate minimum hardly changes the stretch.
+    tolerance: float = 1e-2
+    max_steps: int = 100
+    # A descent ends after a step that lowers the energy by less than this share: further steps change the stretch
+    # little.
+    slow: float = 0.05
+    # A mean energy below this needs no further steps.
+    nothing: float = 1e-5
+    # Smallest energy at the bound that `EvenStretch` uses.
+    least_energy: float = 0.1
+    # From mean energies below this, Newton steps are used directly.
+    near: float = 1.0
+    # Boundary vertices are rounded to this multiple of the root of the area before contacts are sought.
+    gap: float = 2.0**-20
+
+
+_TUNING = ChartTuning()
 
 
 class EvenStretch(Isotropic):
@@ -62,7 +72,7 @@ class EvenStretch(Isotropic):
 
     def __init__(self, bound: float) -> None:
         self._base = SymmetricDirichlet()
-        self._k = 3 / max((bound - 1 / bound) ** 2, _LEAST_ENERGY) ** 2
+        self._k = 3 / max((bound - 1 / bound) ** 2, _TUNING.least_energy) ** 2
 
     def density(self, d: Deformation) -> FloatArray:
         """``E + k E³``."""
@@ -147,7 +157,7 @@ class WorkingChart:
         self.uv = self.piece.fit_scale(uv)
         self.stretch = measure_stretch(self.piece.energy(SymmetricDirichlet(), None), self.uv)
         # Boundaries that are closer than this would touch in the precision of texture coordinates.
-        unit = _GAP * np.sqrt(self.piece.area)
+        unit = _TUNING.gap * np.sqrt(self.piece.area)
         self.crossings, reasons = check_loops(self.piece.loops, np.rint(self.uv / unit) * unit)
         self.bijective = not reasons
 
@@ -204,7 +214,9 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
 
 def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None:
     """Flatten a chart that must not overlap itself; slower than `flatten_chart` and with more stretch."""
-    settings = FlattenOptions(tol=_TOLERANCE, max_iterations=_MAX_STEPS, callback=lambda _: check_wanted())
+    settings = FlattenOptions(
+        tol=_TUNING.tolerance, max_iterations=_TUNING.max_steps, callback=lambda _: check_wanted()
+    )
     result = Flattening(chart.piece, settings, None).run(None)
     chart.use(result.uv)
 
@@ -229,14 +241,14 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
     """Lower an energy of the chart's map, which stays injective."""
     assert chart.uv is not None
     value = chart.piece.energy(density, None).value(in_units(chart.uv, 0))
-    far = value > _NEAR and isinstance(density, SymmetricDirichlet)
+    far = value > _TUNING.near and isinstance(density, SymmetricDirichlet)
     energy = chart.piece.energy(ReweightedDirichlet() if far else density, None)
     descent = SurfaceDescent(energy, chart.uv, "auto")
     before = np.inf
     try:
-        for _ in itertools.islice(descend(descent, density, _TOLERANCE), _MAX_STEPS):
+        for _ in itertools.islice(descend(descent, density, _TUNING.tolerance), _TUNING.max_steps):
             check_wanted()
-            if descent.distortion < _NOTHING or descent.distortion > (1 - _SLOW) * before:
+            if descent.distortion < _TUNING.nothing or descent.distortion > (1 - _TUNING.slow) * before:
                 break
             before = descent.distortion
     finally:

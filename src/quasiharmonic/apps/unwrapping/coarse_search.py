@@ -18,6 +18,8 @@ References
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from quasiharmonic.apps.flattening.worst_triangles import mark_around
@@ -37,26 +39,33 @@ from quasiharmonic.targets.cuts.find import find_cuts_by
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at, to_complex, to_points
 
-# Number of first fits, to rotated triangles. Later fits permit some stretch.
-_ROTATED_FITS = 4
-# Least number of all fits, after which the search stops when the bound is kept.
-_LEAST_FITS = 6
-# The bound counts as kept if at most this part of the free share exceeds it: repairs may stretch a little more.
-_ENOUGH = 0.5
-# Largest number of all fits.
-_MOST_FITS = 16
-# A later fit permits this share of the stretch that the bound permits.
-_PERMITTED = 0.5
-# A triangle whose singular values have a smaller ratio gets a new rotation.
-_LEAST_RATIO = 0.15
-# Maps with a larger share of inverted triangles are not repaired.
-_FEW = 0.05
-# Rings of triangles around inverted ones that are mapped again, first and later.
-_RINGS = 2, 6
-# Maps with more crossings of their boundary than this share of its edges are not used.
-_FEW_CROSSINGS = 0.01
-# A coarse mesh with a larger share of the vertices is cut without a coarser one.
-_LARGEST_SHARE = 0.5
+
+class FitTuning(NamedTuple):
+    """Numbers that tune the fits of maps to rotated triangles, and their repair."""
+
+    # Number of first fits, to rotated triangles. Later fits permit some stretch.
+    rotated_fits: int = 4
+    # Least number of all fits, after which the search stops when the bound is kept.
+    least_fits: int = 6
+    # The bound counts as kept if at most this part of the free share exceeds it: repairs may stretch a little more.
+    enough: float = 0.5
+    # Largest number of all fits.
+    most_fits: int = 16
+    # A later fit permits this share of the stretch that the bound permits.
+    permitted: float = 0.5
+    # A triangle whose singular values have a smaller ratio gets a new rotation.
+    least_ratio: float = 0.15
+    # Maps with a larger share of inverted triangles are not repaired.
+    few: float = 0.05
+    # Rings of triangles around inverted ones that are mapped again, first and later.
+    rings: tuple[int, int] = 2, 6
+    # Maps with more crossings of their boundary than this share of its edges are not used.
+    few_crossings: float = 0.01
+    # A coarse mesh with a larger share of the vertices is cut without a coarser one.
+    largest_share: float = 0.5
+
+
+_TUNING = FitTuning()
 _NO_CUT = np.empty((0, 2), dtype=np.int64)
 
 
@@ -73,7 +82,7 @@ class CoarseSearch:
         F = graph.F
         cost = (graph.cost / edge_graph(graph.V, F).cost)[graph.side].T
         coarser = None
-        if graph.n <= _LARGEST_SHARE * len(self._V):
+        if graph.n <= _TUNING.largest_share * len(self._V):
             coarser = CoarseSearch(self._bound, self._min_gain, self._workers, graph.V)
         found = search_charts(
             cut_into_charts(graph.V, F, _NO_CUT, cost, self._min_gain, coarser),
@@ -162,19 +171,20 @@ def _fit(
     area = 1 / np.abs((g[1].conj() * g[2]).imag)
     fitted = Laplacian(F, n, np.array([0])).factor(2 * area * (g * g[(1, 2, 0), :].conj()).real)
     w = fitted.respond(sum_at(corners.ravel(), (area * turned * g).ravel(), n))
-    most = 1 + _PERMITTED * (bound - 1)
-    for k in range(_MOST_FITS + 1):
+    most = 1 + _TUNING.permitted * (bound - 1)
+    for k in range(_TUNING.most_fits + 1):
         workers.check_wanted()
         p, q = _derivatives(g, w[corners])
         larger, smaller = np.abs(p) + np.abs(q), np.abs(p) - np.abs(q)
         with np.errstate(all="ignore"):
             scale = np.sqrt(area.sum() / (area * larger * smaller).sum())
         good = (larger * scale < bound) & (smaller * scale * bound > 1)
-        if k == _MOST_FITS or (k >= _LEAST_FITS and area[~good].sum() <= _ENOUGH * FREE_SHARE * area.sum()):
+        enough = area[~good].sum() <= _TUNING.enough * FREE_SHARE * area.sum()
+        if k == _TUNING.most_fits or (k >= _TUNING.least_fits and enough):
             break
         # At first the targets are rotations, then the nearest matrices with little stretch.
-        less = 1.0 if k < _ROTATED_FITS else most
-        rotation, collapsed = _direction(p), smaller <= _LEAST_RATIO * larger
+        less = 1.0 if k < _TUNING.rotated_fits else most
+        rotation, collapsed = _direction(p), smaller <= _TUNING.least_ratio * larger
         larger, smaller = np.clip(larger, 1 / less, less), np.clip(smaller, 1 / less, less)
         if collapsed.any():
             # The boundary would stay folded where the rotations of these triangles are wrong.
@@ -189,7 +199,7 @@ def _fit(
     if not np.isfinite(w).all():
         return None
     rim = sum(map(len, chart.piece.loops))
-    if len(check_loops(chart.piece.loops, to_points(w))[0]) > _FEW_CROSSINGS * rim:
+    if len(check_loops(chart.piece.loops, to_points(w))[0]) > _TUNING.few_crossings * rim:
         return None
     return _repair(chart, to_points(w))
 
@@ -211,11 +221,11 @@ def _repair(chart: WorkingChart, uv: FloatArray) -> FloatArray | None:
     """
     n = len(uv)
     rim = mark(n, *chart.piece.loops)
-    for rings in _RINGS:
+    for rings in _TUNING.rings:
         if is_injective(chart.F, uv):
             return uv
         inverted = triangle_signs(chart.F, uv)[0] <= 0
-        if np.count_nonzero(inverted) > _FEW * len(chart.F):
+        if np.count_nonzero(inverted) > _TUNING.few * len(chart.F):
             return None
         loose = mark_rings(chart.F, mark(n, chart.F[inverted]), rings) & ~rim
         rows = np.flatnonzero(has_marked_corner(chart.F, loose))

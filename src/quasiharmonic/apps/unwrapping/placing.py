@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
@@ -28,18 +28,29 @@ from quasiharmonic.util.arrays import (
 )
 from quasiharmonic.util.options import UnwrapOptions
 
-# Angle of the edges that are seams of a lightmap by default, in degrees.
-_HARD = 60.0
-# A filter at half the resolution mixes texels that are closer.
-_LEAST_PADDING = 4
-# Coordinates of later tiles are rounded more coarsely, by this share of the texture's side.
-_ROUNDING = 2.0**-18
-# If charts do not fit at the density of another tile, the density is lowered by this factor, at most so often.
-_LOWER, _TRIALS = 0.97, 20
-# Smallest side of a chart's box in texels. Boxes begin at multiples of it, so that texels of half the resolution fit.
-_CELL = 2
-# The scale is lowered by this factor until all boxes fit, at most so often, and then bisected.
-_LOWER_SCALE, _SCALE_TRIALS, _BISECTIONS = 0.8, 60, 7
+
+class PlacingTuning(NamedTuple):
+    """Numbers that tune how charts are placed in tiles and lightmaps."""
+
+    # Angle of the edges that are seams of a lightmap by default, in degrees.
+    hard: float = 60.0
+    # A filter at half the resolution mixes texels that are closer.
+    least_padding: int = 4
+    # Coordinates of later tiles are rounded more coarsely, by this share of the texture's side.
+    rounding: float = 2.0**-18
+    # If charts do not fit at the density of another tile, the density is lowered by this factor, at most so often.
+    lower: float = 0.97
+    trials: int = 20
+    # Smallest side of a chart's box in texels. Boxes begin at multiples of it, so that texels of half the resolution
+    # fit.
+    cell: int = 2
+    # The scale is lowered by this factor until all boxes fit, at most so often, and then bisected.
+    lower_scale: float = 0.8
+    scale_trials: int = 60
+    bisections: int = 7
+
+
+_TUNING = PlacingTuning()
 
 
 def check_placing(wanted: UnwrapOptions) -> UnwrapOptions:
@@ -52,9 +63,11 @@ def check_placing(wanted: UnwrapOptions) -> UnwrapOptions:
         raise ValueError("in a lightmap each chart has its own place: omit stack")
     if wanted.tiles > 1 or wanted.tile_by is not None or wanted.faces is not None:
         raise ValueError("a lightmap is one texture for all triangles: omit tiles, tile_by and faces")
-    if float(wanted.padding) < _LEAST_PADDING:
-        raise ValueError(f"a lightmap needs a padding of at least {_LEAST_PADDING} texels, not {wanted.padding:g}")
-    return wanted if wanted.hard_edges is not None else replace(wanted, hard_edges=_HARD)
+    if float(wanted.padding) < _TUNING.least_padding:
+        raise ValueError(
+            f"a lightmap needs a padding of at least {_TUNING.least_padding} texels, not {wanted.padding:g}"
+        )
+    return wanted if wanted.hard_edges is not None else replace(wanted, hard_edges=_TUNING.hard)
 
 
 def number_tiles(tile_by: Any, count: int) -> IntArray:
@@ -88,7 +101,7 @@ def place_charts(
         return pack_charts(
             [(chart.uv, chart.F) for chart in some],
             resolution=size,
-            padding=padding if tile is None else padding + _ROUNDING * max(size),
+            padding=padding if tile is None else padding + _TUNING.rounding * max(size),
             texels_per_unit=density,
             tiles=wanted.tiles,
             rotate=wanted.rotate,
@@ -112,14 +125,14 @@ def _pack_tiles(
     groups = {k: [chart for chart, at in zip(charts, tile, strict=True) if at == k] for k in numbers}
     found = {k: pack(groups[k], density) for k in numbers}
     least = min(packing.texels_per_unit for packing in found.values())
-    for trial in range(_TRIALS):
+    for trial in range(_TUNING.trials):
         try:
             fitted = {k: one if one.texels_per_unit == least else pack(groups[k], least) for k, one in found.items()}
             break
         except ValueError:
-            if density is not None or trial == _TRIALS - 1:
+            if density is not None or trial == _TUNING.trials - 1:
                 raise
-            least *= _LOWER
+            least *= _TUNING.lower
     order = np.argsort(tile, kind="stable")
     placements, uvs = [], []
     for k, packing in fitted.items():
@@ -141,13 +154,13 @@ class _TexelBoxes:
     def stretch(self, scale: float) -> FloatArray:
         """Return the factors (c, 2) on both sides of each chart; sides of rectangles become whole texels."""
         sides = np.maximum(self.sides, np.finfo(float).tiny)
-        whole = np.maximum(np.rint(sides * scale), _CELL) / sides
-        even = np.maximum(scale, _CELL / sides.max(axis=1, keepdims=True))
+        whole = np.maximum(np.rint(sides * scale), _TUNING.cell) / sides
+        even = np.maximum(scale, _TUNING.cell / sides.max(axis=1, keepdims=True))
         return np.where(self.rectangular[:, None], whole, even)
 
     def texels(self, scale: float) -> IntArray:
         """Return width and height (c, 2) of the boxes in texels."""
-        return np.maximum(np.ceil(self.sides * self.stretch(scale) - 1e-6), _CELL).astype(np.int64)
+        return np.maximum(np.ceil(self.sides * self.stretch(scale) - 1e-6), _TUNING.cell).astype(np.int64)
 
 
 def _pack_texel_boxes(
@@ -169,13 +182,13 @@ def _pack_texel_boxes(
     scale = density or sqrt(size[0] * size[1] / max(float(sides.prod(axis=1).sum()), np.finfo(float).tiny))
     placed = _place(boxes.texels(scale), size, gap, rotate)
     if density is None:
-        for _ in range(_SCALE_TRIALS):
+        for _ in range(_TUNING.scale_trials):
             if placed is not None:
                 break
-            scale *= _LOWER_SCALE
+            scale *= _TUNING.lower_scale
             placed = _place(boxes.texels(scale), size, gap, rotate)
-        low, high = scale, scale / _LOWER_SCALE
-        for _ in range(_BISECTIONS if placed is not None else 0):
+        low, high = scale, scale / _TUNING.lower_scale
+        for _ in range(_TUNING.bisections if placed is not None else 0):
             middle = sqrt(low * high)
             found = _place(boxes.texels(middle), size, gap, rotate)
             low, high, placed = (low, middle, placed) if found is None else (middle, high, found)
@@ -209,9 +222,9 @@ def _place(texels: IntArray, size: tuple[int, int], gap: int, rotate: bool) -> t
 
     Each box, the highest first, is placed where its upper side is lowest above all boxes before it.
     """
-    margin = _CELL * ceil(gap / (2 * _CELL))
-    columns, rows = ((side - 2 * margin + gap) // _CELL for side in size)
-    cells = -(-(texels + gap) // _CELL)
+    margin = _TUNING.cell * ceil(gap / (2 * _TUNING.cell))
+    columns, rows = ((side - 2 * margin + gap) // _TUNING.cell for side in size)
+    cells = -(-(texels + gap) // _TUNING.cell)
     corners, turned = np.zeros_like(texels), np.zeros(len(texels), dtype=np.int64)
     if columns < 1 or int(cells.prod(axis=1).sum()) > columns * rows:
         return None
@@ -231,5 +244,5 @@ def _place(texels: IntArray, size: tuple[int, int], gap: int, rotate: bool) -> t
             return None
         upper, at, width, height, turned[k] = best
         top[at : at + width] = upper
-        corners[k] = margin + _CELL * at, margin + _CELL * (upper - height)
+        corners[k] = margin + _TUNING.cell * at, margin + _TUNING.cell * (upper - height)
     return corners, turned

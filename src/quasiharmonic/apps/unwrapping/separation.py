@@ -8,6 +8,7 @@ edge length. An exact test decides whether the boundary still meets itself.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -19,19 +20,27 @@ from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.geometry.exact.loops import check_loops, winding
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, sum_at
 
-# Distance that a vertex must have from the edge, relative to the edge's length.
-_GAP = 0.1
-# Weight of a penalty, relative to a triangle's share of the area.
-_WEIGHT = 30.0
-# Maximum number of updates of the pairs, and of Newton steps between them.
-_MAX_UPDATES = 12
-_STEPS = 2
-_TOLERANCE = 1e-2
-# The search stops after this number of successive updates without fewer crossings.
-_MAX_STALLS = 4
-# In larger charts, only some vertices move, at least and at most so many: those at most twice as far from a crossing as
-# crossings are from each other.
-_FEWEST_FREE, _MOST_FREE = 1_000, 5_000
+
+class SeparationTuning(NamedTuple):
+    """Numbers that tune the separation of overlaps."""
+
+    # Distance that a vertex must have from the edge, relative to the edge's length.
+    gap: float = 0.1
+    # Weight of a penalty, relative to a triangle's share of the area.
+    weight: float = 30.0
+    # Maximum number of updates of the pairs, and of Newton steps between them.
+    max_updates: int = 12
+    steps: int = 2
+    tolerance: float = 1e-2
+    # The search stops after this number of successive updates without fewer crossings.
+    max_stalls: int = 4
+    # In larger charts, only some vertices move, at least and at most so many: those at most twice as far from a
+    # crossing as crossings are from each other.
+    fewest_free: int = 1_000
+    most_free: int = 5_000
+
+
+_TUNING = SeparationTuning()
 
 
 class Penetrations:
@@ -68,7 +77,7 @@ class Penetrations:
     def _depth(self, w: ComplexArray) -> FloatArray:
         """How much the distance from the edge is too small, relative to its length; 0 where it is large enough."""
         ahead = (self._normal.conj() * (self._shares * w[self.corners]).sum(axis=0)).real
-        return np.maximum(_GAP - ahead / self._length, 0)
+        return np.maximum(_TUNING.gap - ahead / self._length, 0)
 
     def value(self, w: ComplexArray) -> float:
         """Value at a map (n,)."""
@@ -96,19 +105,19 @@ def separate(chart: WorkingChart, bound: float, check_wanted: Callable[[], objec
     assert chart.uv is not None
     energy = chart.piece.energy(EvenStretch(bound), None)
     fixed = _find_far_vertices(chart)
-    pairs = Penetrations(_WEIGHT / len(chart.F))
+    pairs = Penetrations(_TUNING.weight / len(chart.F))
     system = NewtonSystem(energy.F, energy.g, len(chart.uv), fixed, "auto")
     coordinates = Coordinates.of(chart.uv, fixed, 0)
     model = MapModel(energy, coordinates, system, [pairs])
     w, crossings = in_units(chart.uv, 0), chart.crossings
     fewest, stalls = len(crossings), 0
-    for _ in range(_MAX_UPDATES):
+    for _ in range(_TUNING.max_updates):
         pairs.add(crossings, w)
         descent = NewtonDescent(model, model.evaluate(w))
-        for _ in range(_STEPS):
+        for _ in range(_TUNING.steps):
             check_wanted()
             with np.errstate(all="ignore"):
-                if descent.step(_TOLERANCE) is not None:
+                if descent.step(_TUNING.tolerance) is not None:
                     break
         w = descent.w
         crossings, reasons = check_loops(chart.piece.loops, coordinates.positions(w))
@@ -117,7 +126,7 @@ def separate(chart: WorkingChart, bound: float, check_wanted: Callable[[], objec
             return True
         fewer = len(crossings) < fewest
         fewest, stalls = min(fewest, len(crossings)), 0 if fewer else stalls + 1
-        if not len(crossings) or stalls == _MAX_STALLS:
+        if not len(crossings) or stalls == _TUNING.max_stalls:
             break
     return False
 
@@ -125,13 +134,13 @@ def separate(chart: WorkingChart, bound: float, check_wanted: Callable[[], objec
 def _find_far_vertices(chart: WorkingChart) -> IntArray:
     """Vertices that stay where they are: at least one, and in a large chart all that are far from its overlaps."""
     assert chart.uv is not None
-    if len(chart.uv) <= _FEWEST_FREE:
+    if len(chart.uv) <= _TUNING.fewest_free:
         return np.array([int(chart.piece.loops[0][0])])
     crossed = chart.uv[np.unique(chart.crossings)]
     distance, _ = KDTree(crossed).query(chart.uv)
     near = np.count_nonzero(distance <= 2 * np.linalg.norm(np.ptp(crossed, axis=0)))
     order = np.argsort(distance, kind="stable")
-    return np.sort(order[min(max(near, _FEWEST_FREE), _MOST_FREE, len(order) - 1) :])
+    return np.sort(order[min(max(near, _TUNING.fewest_free), _TUNING.most_free, len(order) - 1) :])
 
 
 def overlapping_share(chart: WorkingChart) -> float:

@@ -17,23 +17,27 @@ from quasiharmonic.apps.unwrapping.hinges import ahead, previous_sides
 from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, repeat_each
 
-# At an edge of more triangles than this, none are joined. The number of pairs grows with its square.
-_MAX_TRIANGLES = 16
 
-# Score of a pair at an edge of several triangles, lower is better. The cosine of the angle between the triangles is -1
-# if the surface is flat there and 1 if it is folded. The penalties exceed this range, so that they take precedence.
-#
-# The orientations of the two triangles disagree.
-_DISAGREEING = 4.0
-# The triangles have different vertices of the file at the edge.
-_FOREIGN = 8.0
-# One of the triangles is so thin that its angle is arbitrary.
-_THIN = 16.0
-# At equal angles a convex edge is preferred, which separates solids that touch along an edge.
-_CONCAVE = 1e-3
+class SheetTuning(NamedTuple):
+    """Numbers that tune which triangles are joined at edges of more than two."""
 
-# Relative difference of two areas that is due to rounding.
-_ROUNDING = 1e-12
+    # At an edge of more triangles than this, none are joined. The number of pairs grows with its square.
+    max_triangles: int = 16
+    # Score of a pair at an edge of several triangles, lower is better. The cosine of the angle between the triangles is
+    # -1 if the surface is flat there and 1 if it is folded. The penalties exceed this range, so that they take
+    # precedence. The orientations of the two triangles disagree.
+    disagreeing: float = 4.0
+    # The triangles have different vertices of the file at the edge.
+    foreign: float = 8.0
+    # One of the triangles is so thin that its angle is arbitrary.
+    thin: float = 16.0
+    # At equal angles a convex edge is preferred, which separates solids that touch along an edge.
+    concave: float = 1e-3
+    # Relative difference of two areas that is due to rounding.
+    rounding: float = 1e-12
+
+
+_TUNING = SheetTuning()
 
 
 class Sheets(NamedTuple):
@@ -154,7 +158,7 @@ def _restore_larger_part(links: Links, turned: BoolArray, area: FloatArray) -> B
     component = label_components(links.one // 3, links.other // 3, area.size)
     most = np.bincount(component, np.where(turned, area, -area), area.size)
     whole = np.bincount(component, area, area.size)
-    restored: BoolArray = turned ^ (most > _ROUNDING * whole)[component]
+    restored: BoolArray = turned ^ (most > _TUNING.rounding * whole)[component]
     return restored
 
 
@@ -200,14 +204,14 @@ def _pair(
     """Choose pairs of sides at edges of three or more triangles, best first; ``crowded`` lists the sides by edge."""
     starts = np.cumsum(count) - count
     picks = []
-    for size in range(3, _MAX_TRIANGLES + 1):
+    for size in range(3, _TUNING.max_triangles + 1):
         i, j = np.triu_indices(size, 1)
         start = starts[count == size, None]
         picks.append(np.stack([start + i, start + j], axis=-1).reshape(-1, 2))
     one, other = np.concatenate(picks).T
     edge = repeat_each(np.arange(count.size), count)[one]
     score = _score_pairs(points, F, corners, turned, crowded[one], crowded[other])
-    score += _THIN * (thin[crowded[one] // 3] | thin[crowded[other] // 3])
+    score += _TUNING.thin * (thin[crowded[one] // 3] | thin[crowded[other] // 3])
     order = np.lexsort((other, one, score, edge))
     edge, one, other = edge[order], one[order], other[order]
     free, chosen = np.ones(crowded.size, dtype=bool), []
@@ -243,8 +247,8 @@ def _score_pairs(
         [np.where(tail[side] == end, in_file[side], ahead[side]) for side in (one, other)] for end in (low, high)
     )
     foreign = (low_in_file[0] != low_in_file[1]) | (high_in_file[0] != high_in_file[1])
-    score: FloatArray = (inward * outward).sum(axis=1) + _DISAGREEING * unlike + _FOREIGN * foreign
-    return score + np.where(unlike, 0.0, _CONCAVE * (normal * outward).sum(axis=1))
+    score: FloatArray = (inward * outward).sum(axis=1) + _TUNING.disagreeing * unlike + _TUNING.foreign * foreign
+    return score + np.where(unlike, 0.0, _TUNING.concave * (normal * outward).sum(axis=1))
 
 
 def _normalise(vectors: FloatArray) -> FloatArray:
