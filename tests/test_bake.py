@@ -433,4 +433,4 @@ def test_wrong_arguments(tmp_path):
     with pytest.raises(ValueError, match="without triangles"):
         bake(io.MeshData(uv, np.empty((0, 3), int)), old.with_map(uv))
     half = bake(old, old.with_map(np.add(uv, [0.9, 0])), size=8)
-    assert "outside the unit square" in half.problems[0]
+    assert "beyond the unit square" in half.problems[0]

@@ -141,5 +141,7 @@ def test_other_settings_are_an_error(models, tmp_path, capsys):
         batch.Settings(unwrap={"uv": []})
     with pytest.raises(ValueError, match="must be a dict"):
         batch.Settings(unwrap=True)
+    with pytest.raises(ValueError, match="a lightmap is one texture"):
+        batch.Settings(unwrap={"lightmap": True, "tiles": 2})
     assert run("batch", models, "-o", tmp_path / "out", "--max-stretch", "1.3") == 2
     assert "--max-stretch applies only to --unwrap" in capsys.readouterr().err

@@ -54,6 +54,23 @@ def test_command_line(model, tmp_path, words, count):
     assert len(np.unique(np.round(centres, 5), axis=0)) == count
 
 
+def test_walls_of_one_component_are_apart_and_those_of_another_lie_on_them():
+    box = np.array([[x, y, z] for x in (0, 1.0) for y in (0, 1.0) for z in (0, 1.0)])
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    F = np.concatenate([quads[:, :3], quads[:, (0, 2, 3)]])
+    options = {"stack": True, "symmetry": None, "hard_edges": 30, "resolution": 256}
+    alone = unwrap(box, F, **options)
+    assert (alone.n_charts, places(alone)) == (6, 6)
+    longer = np.add(box, [5, 0, 0]) * [1, 1, 2]
+    three = (
+        np.concatenate([box, np.add(box, [2, 0, 0])[:, ::-1] * [-1, 1, 1], longer]),
+        np.concatenate([F, F + 8, F + 16]),
+    )
+    together = unwrap(*three, **options)
+    # Faces of another solid are not those of identical components, although they are congruent.
+    assert (together.n_charts, places(together)) == (18, 12)
+
+
 def test_bad_input_is_named(model):
     with pytest.raises(ValueError, match="stack must be True, False or 'mirrored', not 'both'"):
         unwrap(*model, stack="both")

@@ -13,10 +13,11 @@ from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import close_slits
 from quasiharmonic.apps.unwrapping.charts import Chart, find_charts
 from quasiharmonic.apps.unwrapping.layout import ChartLayout, grid_unit, round_positions
+from quasiharmonic.apps.unwrapping.separation import separate
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.results import UnwrapStatus
 from quasiharmonic.surfaces import disk, grid
-from shared.meshes import boundary_of
+from shared.meshes import boundary_of, lift
 
 
 def sphere(n):
@@ -251,3 +252,13 @@ def test_a_vertex_without_data(height):
     V = np.pad(V, [(0, 0), (0, 1)])
     V[-1, 2] = height
     assert unwrap(V, F).certificate.bijective
+
+
+def test_a_large_chart_without_crossings_is_separated_without_an_error():
+    points, triangles = disk(20)
+    assert len(points) > 1000
+    rows, vertices = np.arange(len(triangles)), np.arange(len(points))
+    chart = WorkingChart(rows, vertices, lift(points), triangles, np.ones(triangles.shape))
+    chart.use(points)
+    assert not chart.crossings.size
+    assert separate(chart, 1.5, lambda: None)

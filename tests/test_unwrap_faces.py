@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -70,6 +71,14 @@ def test_charts_that_do_not_fit_are_an_error_with_a_sufficient_density():
         unwrap(V, F, resolution=256, uv=UV, faces=SOME, texels_per_unit=90)
     density = float(str(caught.value).split("texels_per_unit=")[1].split()[0])
     assert unwrap(V, F, resolution=256, uv=UV, faces=SOME, texels_per_unit=density).success
+
+
+def test_many_charts_that_do_not_fit_are_an_error_within_seconds():
+    faces = np.random.default_rng(0).random(len(F)) < 0.5
+    began = time.process_time()
+    with pytest.raises(ValueError, match="charts with a padding of 4 texels do not fit into the free part"):
+        unwrap(V, F, resolution=64, uv=UV, faces=faces)
+    assert time.process_time() - began < 20
 
 
 def test_no_free_space_is_an_error():

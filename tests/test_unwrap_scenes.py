@@ -186,6 +186,17 @@ def test_files_with_instances(tmp_path, instances):
     assert unwrap(read).n_charts == unwrap(out).n_charts
 
 
+@pytest.mark.parametrize("scale", [0, 0.1])
+def test_instances_of_a_file_have_the_density_of_the_largest(tmp_path, scale):
+    scene = trimesh.Scene()
+    scene.add_geometry(make_mesh(BOX), node_name="small", geom_name="box", transform=np.diag([scale] * 3 + [1]))
+    scene.graph.update(frame_to="large", geometry="box", matrix=np.diag([3.0, 3, 3, 1]))
+    scene.export(tmp_path / "in.glb")
+    assert main(["unwrap", str(tmp_path / "in.glb"), "-o", str(tmp_path / "out.glb"), "--resolution", "512"]) == 0
+    read = io.read_mesh(tmp_path / "out.glb")
+    np.testing.assert_allclose(np.ptp(read.V, axis=0), 3 * np.ptp(BOX[0], axis=0), rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [(["--instances", "own"], "has no instances"), (["--instances", "none"], "invalid choice")],
@@ -224,6 +235,20 @@ def test_a_thousand_small_meshes():
 def test_wrong_kinds_of_lists_and_weights(given, options, message):
     with pytest.raises(ValueError, match=message):
         unwrap(given(), **options)
+
+
+def test_different_materials_of_one_name_have_tiles_of_their_own():
+    material = trimesh.visual.material.SimpleMaterial
+    red, green, red_again = (material(diffuse=colour) for colour in ([255, 0, 0], [0, 255, 0], [255, 0, 0]))
+    meshes = []
+    for one in (red, green, red_again):
+        mesh = make_mesh(BOX)
+        mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(mesh.vertices), 2)), material=one)
+        meshes.append(mesh)
+    tiles = [set(np.floor(part.uvs[:, 0])) for part in unwrap(meshes, tile_by="material").parts]
+    assert tiles == [{0.0}, {1.0}, {0.0}]
+    with pytest.raises(ValueError, match="there are no materials"):
+        unwrap([make_mesh(BOX)], tile_by="material")
 
 
 @pytest.mark.slow

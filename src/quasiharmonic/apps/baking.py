@@ -230,6 +230,8 @@ def _as_mesh(name: str, mesh: object) -> MeshData:
         return read_mesh(mesh)
     if not isinstance(mesh, MeshData):
         raise TypeError(f"{name} must be a MeshData or the path of a file, not {describe(mesh)}")
+    if mesh.extra is not None and len(mesh.extra) != len(mesh.V):
+        raise ValueError(f"{name} has extra data for {len(mesh.extra)} vertices, but {len(mesh.V)} vertices")
     return mesh
 
 
@@ -268,16 +270,17 @@ class _Baker:
         bare = np.isnan(uv).any(axis=(1, 2))
         if bare.all():
             raise ValueError("the new model has no texture coordinates: unwrap it first")
-        outside = np.zeros_like(bare)
-        for axis in range(2):
-            outside |= (uv[:, :, axis].max(axis=1) < 0) | (uv[:, :, axis].min(axis=1) > 1)
-        if (outside | bare).all():
+        low, high = np.nanmin(uv, axis=1, initial=np.inf), np.nanmax(uv, axis=1, initial=-np.inf)
+        if (((high <= 0) | (low >= 1)).any(axis=1) | bare).all():
             raise ValueError(
                 "the new model has no texture coordinates in the unit square: move them there, or unwrap it again"
             )
+        # No centre of a texel is farther outside than half a texel.
+        margin = 0.5 / np.array([self._width, self._height])
+        outside = ((low < -margin) | (high > 1 + margin)).any(axis=1) & ~bare
         if outside.any():
-            count = count_of("triangle is", "triangles are", int(outside.sum()))
-            self.problems.append(f"{count} outside the unit square of the new texture coordinates, and not baked")
+            count = count_of("triangle reaches", "triangles reach", int(outside.sum()))
+            self.problems.append(f"{count} beyond the unit square of the new texture coordinates, and not baked there")
         a, b, c = self._corners.swapaxes(0, 1)
         longest = np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
         degenerate = np.linalg.norm(np.cross(b - a, c - a), axis=1) <= _TUNING.thin * longest

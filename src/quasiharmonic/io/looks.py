@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
+
+import numpy as np
 
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.formats.gltf import document as gltf
@@ -35,6 +37,19 @@ from quasiharmonic.io.untrusted import read_bytes, resolve_beside
 # Entries of material libraries about images that `read_appearance` reads.
 _IMAGES: dict[bytes, Role] = {b"map_Kd": "colour", b"map_Ke": "emission"}
 _GLTF = ".glb", ".gltf"
+# Options of images in material libraries by their largest number of values. All values are required, except those of
+# the first three, which are one to three numbers.
+_IMAGE_OPTIONS = {
+    **{b"-s": 3, b"-o": 3, b"-t": 3, b"-mm": 2},
+    **dict.fromkeys(
+        (b"-bm", b"-boost", b"-texres", b"-imfchan", b"-type", b"-blendu", b"-blendv", b"-cc", b"-clamp"), 1
+    ),
+}
+# Those that change an image and are not read.
+_LOST_OPTIONS = b"-t", b"-mm", b"-imfchan", b"-type"
+# Entries of materials that are not read, although they change how a surface looks; those that are numbers unless zero.
+_LOST_ENTRIES = (b"map_", b"norm", b"bump", b"disp", b"decal", b"refl")
+_LOST_NUMBERS = b"Pc", b"Pcr", b"Ps", b"aniso", b"anisor"
 # Keywords of images in material libraries.
 _IMAGE_KEYWORD = re.compile(rb"bump|decal|disp|norm|map_(?!aat$).*", re.IGNORECASE | re.DOTALL)
 
@@ -48,7 +63,12 @@ def read_appearance(mesh: MeshData) -> Appearance:
     if isinstance(mesh.carried, CarriedGltf) and mesh.carried.fits(mesh):
         return gltf_appearance(mesh.carried)
     materials, problems = _read_libraries(mesh)
-    return plain_appearance(mesh, materials, colours_of(mesh), problems)
+    if mesh.carried is not None and mesh.carried.fits(mesh):
+        problems += tuple(f"{name} is not baked" for name in mesh.carried.unread_looks())
+    colours = colours_of(mesh)
+    if mesh.extra is not None and colours is None and mesh.extra.shape[1] in (3, 4):
+        problems += ("colours of vertices are not baked: some are missing, or not from 0 to 1",)
+    return plain_appearance(mesh, materials, colours, problems)
 
 
 def _read_libraries(mesh: MeshData) -> tuple[dict[str, SurfaceMaterial], tuple[str, ...]]:
@@ -74,16 +94,57 @@ def _read_libraries(mesh: MeshData) -> tuple[dict[str, SurfaceMaterial], tuple[s
                 found[name] = replace(material, colour=(*material.colour[:3], opacity), alpha_mode=mode)
             elif keyword == b"Ke":
                 found[name] = replace(material, emission=tuple(map(float, words[1:4])))
+            elif keyword == b"Pr":
+                found[name] = replace(material, roughness=float(words[1]))
+            elif keyword == b"Pm":
+                found[name] = replace(material, metallic=float(words[1]))
             elif keyword in _IMAGES:
-                image = _read_image(mesh, within / os.fsdecode(words[-1]))
-                wrap: Wrap = "clamp" if b"-clamp on" in b" ".join(words) else "repeat"
-                use = ImageUse(image, wrap=(wrap, wrap))
+                use, lost = _use_image(mesh, words, within)
                 found[name] = replace(material, textures={**material.textures, _IMAGES[keyword]: use})
-            elif keyword.startswith((b"map_", b"norm", b"bump")):
+                problems += [f"{option} of {keyword.decode()} of material {name} is not baked" for option in lost]
+            elif keyword.startswith(_LOST_ENTRIES) or (keyword in _LOST_NUMBERS and any(map(float, words[1:]))):
                 problems.append(f"{keyword.decode('utf-8', 'replace')} of material {name} is not baked")
         except ValueError:
             problems.append(f"{keyword.decode('utf-8', 'replace')} of material {name} is not a number")
     return found, tuple(problems)
+
+
+def _use_image(mesh: MeshData, words: Sequence[bytes], within: Path) -> tuple[ImageUse, list[str]]:
+    """Return the image of an entry of a library in the folder ``within``, and the options that are not read."""
+    options, name = _image_options(words)
+    scale, offset = np.ones(2), np.zeros(2)
+    for option, numbers in ((b"-s", scale), (b"-o", offset)):
+        given = options.get(option, [])[:2]
+        numbers[: len(given)] = list(map(float, given))
+    # Vertical coordinates of libraries point upwards.
+    transform = np.array([[scale[0], 0, offset[0]], [0, scale[1], 1 - scale[1] - offset[1]]])
+    wrap: Wrap = "clamp" if options.get(b"-clamp") == [b"on"] else "repeat"
+    lost = [option.decode() for option in _LOST_OPTIONS if option in options]
+    return ImageUse(_read_image(mesh, within / name), wrap=(wrap, wrap), transform=transform), lost
+
+
+def _image_options(words: Sequence[bytes]) -> tuple[dict[bytes, list[bytes]], str]:
+    """Return the options of an entry about an image, and the name of the image, which may have blanks."""
+    options: dict[bytes, list[bytes]] = {}
+    at = 1
+    while at < len(words) - 1 and (most := _IMAGE_OPTIONS.get(words[at])):
+        end = at + 1
+        while end < len(words) - 1 and end <= at + most and (most < 3 or _is_number(words[end])):
+            end += 1
+        options[words[at]] = list(words[at + 1 : end])
+        at = end
+    # Unknown options have an unknown number of values.
+    name = os.fsdecode(words[-1] if words[at].startswith(b"-") else b" ".join(words[at:]))
+    # Some programs quote names, or write the separators of Windows.
+    return options, name.strip('"').replace("\\", "/")
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _read_image(mesh: MeshData, name: Path) -> NamedImage:
@@ -105,7 +166,7 @@ def own_texture(mesh: MeshData) -> Texture | None:
         return _of_gltf(Path(mesh.source))
     for words, within in library_entries(mesh):
         if words[0] == b"map_Kd":
-            data = _read_image(mesh, within / os.fsdecode(words[-1])).data
+            data = _read_image(mesh, within / _image_options(words)[1]).data
             if data is not None and (texture := texture_of(data)) is not None:
                 return texture
     return None
@@ -123,16 +184,14 @@ def texture_names(mesh: MeshData) -> list[str]:
         except gltf.DAMAGE:
             # A damaged description of a material does not prevent other work.
             return []
-    textures = (os.fsdecode(words[-1]) for words, _ in library_entries(mesh) if _IMAGE_KEYWORD.fullmatch(words[0]))
-    # Names in libraries can have the separators of any system.
-    return list(dict.fromkeys(PureWindowsPath(name).name for name in textures))
+    textures = (_image_options(words)[1] for words, _ in library_entries(mesh) if _IMAGE_KEYWORD.fullmatch(words[0]))
+    return list(dict.fromkeys(PurePosixPath(name).name for name in textures))
 
 
 def library_entries(mesh: MeshData) -> Iterator[tuple[list[bytes], Path]]:
     """Yield the entries of the OBJ file's material libraries: at least two words, and the folder of the library.
 
-    Only libraries in the folder of the file are opened. Their folders are relative to it. The last word of an entry
-    about an image is its name; options such as -s precede it.
+    Only libraries in the folder of the file are opened. Their folders are relative to it.
     """
     folder = Path(mesh.source).parent
     for line in mesh.statements.split(b"\n"):

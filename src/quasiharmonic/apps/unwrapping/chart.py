@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from quasiharmonic.apps.atlas.packing.pack import find_copies
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
+from quasiharmonic.geometry.mesh.topology import components
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
+
+# Areas and moments of congruent components have at most this relative difference.
+_SAME_MEASURES = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,13 +103,60 @@ def mirror_charts(F: IntArray, charts: list[Chart], mirror: Mirror) -> list[Char
     return [*charts, *(_mirror(F, chart, mirror) for chart in charts)]
 
 
-def pair_charts(charts: list[Chart], mirror: Mirror | None) -> list[int]:
+def number_kinds(
+    charts: list[Chart], stack: bool | str, mirror: Mirror | None, V: FloatArray, F: IntArray
+) -> list[int] | None:
+    """Return a number for each chart, the same for charts that may share texture coordinates; None if none do.
+
+    ``stack`` is the option of `unwrap`; ``V`` (n, 3) and ``F`` (f, 3) are the whole surface.
+    """
+    if not stack:
+        return None
+    return _pair_charts(charts, mirror) if stack == "mirrored" else _number_copies(charts, V, F)
+
+
+def _pair_charts(charts: list[Chart], mirror: Mirror | None) -> list[int]:
     """Return a number for each chart that it shares with its mirror image only; charts without one have their own."""
     owner = {chart.triangles.tobytes(): k for k, chart in enumerate(charts)}
     if mirror is None:
         return list(range(len(charts)))
     images = [owner.get(np.sort(mirror.triangle[chart.triangles]).tobytes(), k) for k, chart in enumerate(charts)]
     return [min(k, image) for k, image in enumerate(images)]
+
+
+def _number_copies(charts: list[Chart], V: FloatArray, F: IntArray) -> list[int]:
+    """Return a number for each chart, the same only for charts of different components that are congruent.
+
+    Congruent components have equal numbers of vertices and triangles, areas, and moments. Congruent charts of one
+    component have different numbers.
+    """
+    label = components(F, len(V))[F[:, 0]]
+    kinds = dict[int, int]()
+    known = list[tuple[int, FloatArray]]()
+    for component in np.unique(label).tolist():
+        rows = label == component
+        corners = V[F[rows]]
+        corners = corners - corners.mean(axis=(0, 1))
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area, centre = np.linalg.norm(normal, axis=1), corners.mean(axis=1)
+        moments = np.sqrt(np.maximum(np.linalg.eigvalsh(np.einsum("k,ki,kj->ij", area, centre, centre)), 0))
+        measures = np.array([area.sum(), *(moments * np.sqrt(area.sum()))])
+        near = _SAME_MEASURES * np.abs(measures).max()
+        count = int(np.count_nonzero(rows))
+        equal = (k for k, (n, other) in enumerate(known) if n == count and np.abs(other - measures).max() <= near)
+        kinds[component] = next(equal, len(known))
+        known.append((count, measures))
+    # Of congruent charts of a component, the k-th is stacked with the k-th of other components.
+    same = find_copies([(chart.uv, chart.F) for chart in charts])
+    ranks, numbers = Counter[tuple[int, int]](), dict[tuple[int, int, int], int]()
+    found = []
+    for k, chart in enumerate(charts):
+        component = int(label[chart.triangles[0]])
+        shape = same[k].original if k in same else k
+        key = kinds[component], shape, ranks[component, shape]
+        ranks[component, shape] += 1
+        found.append(numbers.setdefault(key, len(numbers)))
+    return found
 
 
 def _mirror(F: IntArray, chart: Chart, mirror: Mirror) -> Chart:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from quasiharmonic.apps.atlas.packing.layout import MAX_SIZE
-from quasiharmonic.apps.atlas.packing.pack import Packing, Placement, pack_charts
+from quasiharmonic.apps.atlas.packing.pack import Packing, Placement, check_texture, pack_charts
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.util.arrays import (
     BoolArray,
@@ -53,21 +53,26 @@ class PlacingTuning(NamedTuple):
 _TUNING = PlacingTuning()
 
 
-def check_placing(wanted: UnwrapOptions) -> UnwrapOptions:
-    """Return the options, with those that a lightmap implies; ValueError for options that exclude each other."""
+def check_placing(wanted: UnwrapOptions) -> tuple[UnwrapOptions, tuple[int, int]]:
+    """Return the options, with those that a lightmap implies, and width and height of the texture.
+
+    ValueError for options that exclude each other.
+    """
+    size = check_texture(
+        wanted.resolution, wanted.padding, wanted.texels_per_unit, wanted.tiles, wanted.rotate, bool(wanted.stack)
+    )
     if wanted.tile_by is not None and (wanted.tiles > 1 or wanted.faces is not None or wanted.stack):
         raise ValueError("tile_by gives each material a tile of its own: omit tiles, faces and stack")
     if not wanted.lightmap:
-        return wanted
+        return wanted, size
     if wanted.stack:
         raise ValueError("in a lightmap each chart has its own place: omit stack")
     if wanted.tiles > 1 or wanted.tile_by is not None or wanted.faces is not None:
         raise ValueError("a lightmap is one texture for all triangles: omit tiles, tile_by and faces")
     if float(wanted.padding) < _TUNING.least_padding:
-        raise ValueError(
-            f"a lightmap needs a padding of at least {_TUNING.least_padding} texels, not {wanted.padding:g}"
-        )
-    return wanted if wanted.hard_edges is not None else replace(wanted, hard_edges=_TUNING.hard)
+        least = _TUNING.least_padding
+        raise ValueError(f"a lightmap needs a padding of at least {least} texels, not {wanted.padding:g}")
+    return wanted if wanted.hard_edges is not None else replace(wanted, hard_edges=_TUNING.hard), size
 
 
 def number_tiles(tile_by: Any, count: int) -> IntArray:

@@ -290,7 +290,10 @@ def _unwrap_scene(
 
 
 def _number_materials(sources: Sequence[Any], triangles: Sequence[int]) -> IntArray:
-    """Return the number of the material (f,) of each triangle of several meshes; materials of one name are one."""
+    """Return the number of the material (f,) of each triangle of several meshes; equal materials of one name are one.
+
+    ValueError if there are none. Materials of files with one name are equal.
+    """
     known, numbers = dict[object, int](), []
     for source, count in zip(sources, triangles, strict=True):
         if isinstance(source, MeshData):
@@ -298,9 +301,12 @@ def _number_materials(sources: Sequence[Any], triangles: Sequence[int]) -> IntAr
             keys: list[object] = [b"", *names]
         else:
             material = getattr(getattr(source, "visual", None), "material", None)
-            name = getattr(material, "name", None)
-            label, keys = np.zeros(count, dtype=np.int64), [id(material) if name is None else str(name).encode()]
+            # Materials of trimesh with equal contents have equal hashes; many have the same name.
+            own = (getattr(material, "name", None), hash(material))
+            label, keys = np.zeros(count, dtype=np.int64), [b"" if material is None else own]
         numbers.append(np.array([known.setdefault(key, len(known)) for key in keys])[label])
+    if set(known) <= {b""}:
+        raise ValueError("tile_by='material', but there are no materials: omit tile_by, or give numbers")
     return np.concatenate(numbers)
 
 

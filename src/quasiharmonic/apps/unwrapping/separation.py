@@ -132,9 +132,12 @@ def separate(chart: WorkingChart, bound: float, check_wanted: Callable[[], objec
 
 
 def _find_far_vertices(chart: WorkingChart) -> IntArray:
-    """Vertices that stay where they are: at least one, and in a large chart all that are far from its overlaps."""
+    """Vertices that stay where they are: at least one, and in a large chart all that are far from its crossings.
+
+    A chart that overlaps itself has no crossings if one of its loops lies on the wrong side of another.
+    """
     assert chart.uv is not None
-    if len(chart.uv) <= _TUNING.fewest_free:
+    if len(chart.uv) <= _TUNING.fewest_free or not len(chart.crossings):
         return np.array([int(chart.piece.loops[0][0])])
     crossed = chart.uv[np.unique(chart.crossings)]
     distance, _ = KDTree(crossed).query(chart.uv)

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY
-from quasiharmonic.apps.atlas.packing.pack import check_texture
-from quasiharmonic.apps.unwrapping.chart import Chart, pair_charts
+from quasiharmonic.apps.unwrapping.chart import Chart, number_kinds
 from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, divide_long_charts, mend_charts
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
@@ -242,11 +241,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     began = time.perf_counter()
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    wanted = check_placing(UnwrapOptions(**options))
+    wanted, size = check_placing(UnwrapOptions(**options))
     tile = None if wanted.tile_by is None else number_tiles(wanted.tile_by, len(F))
-    size = check_texture(
-        wanted.resolution, wanted.padding, wanted.texels_per_unit, wanted.tiles, wanted.rotate, bool(wanted.stack)
-    )
     corner_uv = None if wanted.uv is None else _corner_positions(wanted.uv, F, len(V))
     if corner_uv is not None and np.isnan(corner_uv).all():
         corner_uv = None
@@ -300,7 +296,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             wanted,
             size,
             density,
-            kinds=pair_charts(charts, rules.mirror) if wanted.stack == "mirrored" else None,
+            kinds=number_kinds(charts, wanted.stack, rules.mirror, points, cleaned.F),
             closely=_PACKED_CLOSELY if ended else BITMAPS,
             occupied=None if kept is None or not kept.count else (kept.layout.uv, kept.layout.rows),
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any
@@ -25,6 +26,13 @@ _SECOND_PLACES = "texcoord1"
 _RINGS = "vertex_indices", "vertex_index"
 _COLOUR = "red", "green", "blue", "alpha"
 _NORMAL = "nx", "ny", "nz"
+# Columns that are read, by element.
+_READ = {
+    "vertex": {"x", "y", "z", *_COLOUR, *_NORMAL, *chain(*_PLACES)},
+    "face": {*_RINGS, _CORNER_PLACES},
+}
+# Other data that programs show: columns of colours, and images that a comment names.
+_LOOK = re.compile("TextureFile |(red|green|blue|alpha|diffuse_.*|texnumber) of (vertex|face)$")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +42,17 @@ class CarriedPly(Carried):
     tables: PlyTables
 
     def further(self) -> list[str]:
-        read = {"x", "y", "z", *_COLOUR, *_NORMAL, *_RINGS, _CORNER_PLACES, *chain(*_PLACES)}
-        return [
+        columns = [
             f"{column.name} of {element.name}"
             for element in self.tables.elements
             for column in element.columns
-            if element.name not in ("vertex", "face") or column.name not in read
+            if column.name not in _READ.get(element.name, ())
         ]
+        remarks = [b" ".join(line.split()[1:]).decode("utf-8", "replace") for line in self.tables.remarks]
+        return columns + [text for text in remarks if text.startswith("TextureFile ")]
+
+    def unread_looks(self) -> list[str]:
+        return [name for name in self.further() if _LOOK.match(name)]
 
 
 def read_ply(path: str | os.PathLike[str]) -> MeshData:

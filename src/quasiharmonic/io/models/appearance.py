@@ -113,8 +113,11 @@ def plain_appearance(
     if colours is not None:
         opaque = np.ones((len(colours), 1)) if colours.shape[1] == 3 else colours[:, 3:]
         corners = np.concatenate([to_linear(colours[:, :3]), opaque], axis=1)[mesh.F]
+    found = [materials.get(names[k] or "", SurfaceMaterial()) for k in used.tolist()]
+    if corners is not None and (corners[..., 3] < 1).any():
+        found = [replace(one, alpha_mode="BLEND") for one in found]
     return Appearance(
-        tuple(materials.get(names[k] or "", SurfaceMaterial()) for k in used.tolist()),
+        tuple(found),
         of_triangle.reshape(-1),
         {0: mesh.corner_uv * [1, -1] + [0, 1]},
         corners,

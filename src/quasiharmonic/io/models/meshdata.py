@@ -42,6 +42,10 @@ class Carried:
         """Return descriptions of the data besides the mesh, which only a writer of the same format keeps."""
         return []
 
+    def unread_looks(self) -> list[str]:
+        """Return descriptions of those data that change how the mesh looks and are not read."""
+        return []
+
     def number_meshes(self) -> IntArray | None:
         """Return the number of the mesh (n,) of each vertex; None if the file has one mesh."""
         return None

@@ -61,7 +61,10 @@ def _unwrap_options(name: str, value: Any) -> None:
     for unusable in ("callback", "edge_costs", "uv", "jobs"):
         if unusable in value:
             raise ValueError(f"{name} cannot have the option {unusable}: omit it")
-    UnwrapOptions(**value)
+    # Import on demand: other runs need no charts.
+    from quasiharmonic.apps.unwrapping.placing import check_placing
+
+    check_placing(UnwrapOptions(**value))
 
 
 @dataclass(frozen=True)

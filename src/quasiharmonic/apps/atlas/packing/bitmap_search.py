@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.atlas.packing.board import HALF_DIAGONAL, Bitmaps, Board, Spot, draw, draw_in_place
+from quasiharmonic.apps.atlas.packing.board import HALF_DIAGONAL, Bitmaps, Board, Occupied, Spot, count_cells, draw
 from quasiharmonic.apps.atlas.packing.shapes import Shape
 from quasiharmonic.util.arrays import ComplexArray, IntArray
 from quasiharmonic.util.progress import heartbeat
@@ -45,6 +45,8 @@ class BitmapTuning(NamedTuple):
     many_per_tile: int = 20
     # The number of cells along a tile is at least this multiple of the expected number.
     fewest_cells: float = 0.8
+    # Cells need not be smaller than this fraction of a texel, whose padding would have many of them.
+    cells_per_texel: int = 4
     # Few charts have sixteen directions each up to this number, and eight above.
     sixteen_directions: int = 20
     # Relative precision of the first scale of few charts.
@@ -98,14 +100,15 @@ class BitmapSearch:
         bitmaps: int = BITMAPS,
         given: ComplexArray | None = None,
         skewed: bool = True,
-        occupied: Shape | None = None,
+        occupied: Occupied | None = None,
         finer: int = 1,
     ) -> None:
         self._size, self._tiles, self._padding = size, tiles, padding
         few = len(shapes) <= MANY
         cells = finer * ((_TUNING.cells if given is None else _TUNING.fine_cells) if few else _TUNING.cells_of_many)
         number = _TUNING.charts_per_tile if few else _TUNING.many_per_tile
-        self.cells = ceil(min(cells * max(1.0, sqrt(len(shapes) / tiles / number)), MOST_CELLS))
+        most = min(MOST_CELLS, _TUNING.cells_per_texel * max(size))
+        self.cells = ceil(min(cells * max(1.0, sqrt(len(shapes) / tiles / number)), most))
         # Length of a cell's side.
         self._cell = max(size) / self.cells / scale
         radius = MORE_CELLS * padding / 2 * self.cells / max(size) + HALF_DIAGONAL
@@ -203,7 +206,7 @@ class BitmapSearch:
         ``parts`` (n,) restricts the directions of each shape to one half, 1 or 2, or not, 0.
         """
         texels = max(self._size) / cells
-        columns, rows = (int(side / texels * (1 + 1e-12)) for side in self._size)
+        columns, rows = count_cells(self._size, texels)
         if self._least_cells > self._tiles * columns * rows:
             return None
         boards: list[Board] = []
@@ -211,9 +214,7 @@ class BitmapSearch:
         def open_board() -> Board:
             board = Board(rows, columns, windows=self._windows)
             if self._occupied is not None:
-                tile = len(boards)
-                corner = complex(tile % 10 * self._size[0], tile // 10 * self._size[1])
-                board.put(draw_in_place(self._occupied.move(-corner, 1 / texels), rows, columns, self._radius), 0, 0)
+                board.put(self._occupied.draw(len(boards), cells, self._radius), 0, 0)
             boards.append(board)
             return board
 

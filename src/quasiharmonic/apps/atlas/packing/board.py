@@ -25,6 +25,8 @@ class BoardTuning(NamedTuple):
     windows: tuple[int, ...] = (64, 128)
     # A window without a free position is searched again for bitmaps with less than this share of the cells.
     smaller: float = 0.8
+    # Number of cells along a tile, from which a bound of the free area is found.
+    bound_cells: int = 512
 
 
 _TUNING = BoardTuning()
@@ -299,6 +301,39 @@ def draw_in_place(shape: Shape, rows: int, columns: int, radius: float) -> BoolA
     found = _fill(tails, heads, rows, columns)
     _mark_near(found, tails[~beside], heads[~beside], radius)
     return found
+
+
+class Occupied:
+    """What is in tiles of a size (w, h): a shape in texels. Tile k starts at ``(k % 10, k // 10)`` times the size."""
+
+    def __init__(self, shape: Shape, size: tuple[int, int]) -> None:
+        self._shape, self._size = shape, size
+        self._drawn: dict[tuple[int, int, float], BoolArray] = {}
+
+    def draw(self, tile: int, cells: int, radius: float) -> BoolArray:
+        """Return the cells of a tile within a distance of the shape, with ``cells`` along its longer side.
+
+        The unit of ``radius`` is a cell.
+        """
+        key = tile, cells, radius
+        if key not in self._drawn:
+            texels = max(self._size) / cells
+            columns, rows = count_cells(self._size, texels)
+            corner = complex(tile % 10 * self._size[0], tile // 10 * self._size[1])
+            self._drawn[key] = draw_in_place(self._shape.move(-corner, 1 / texels), rows, columns, radius)
+        return self._drawn[key]
+
+    def free_area(self, tiles: int, padding: float) -> float:
+        """Return an upper bound of the area of tiles at half the padding from the shape, in square texels."""
+        cells = min(max(self._size), _TUNING.bound_cells)
+        texels = max(self._size) / cells
+        radius = max(padding / 2 / texels - HALF_DIAGONAL, 0.0)
+        return texels**2 * sum(np.count_nonzero(~self.draw(tile, cells, radius)) for tile in range(tiles))
+
+
+def count_cells(size: tuple[int, int], texels: float) -> tuple[int, int]:
+    """Return the numbers of whole cells of some texels along the sides of a tile."""
+    return int(size[0] / texels * (1 + 1e-12)), int(size[1] / texels * (1 + 1e-12))
 
 
 def _fill(tails: ComplexArray, heads: ComplexArray, h: int, w: int) -> BoolArray:

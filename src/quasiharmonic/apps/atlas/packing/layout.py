@@ -17,6 +17,7 @@ from quasiharmonic.apps.atlas.packing.bitmap_search import (
     BitmapSearch,
     Layout,
 )
+from quasiharmonic.apps.atlas.packing.board import Occupied
 from quasiharmonic.apps.atlas.packing.shapes import Shape
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
 
@@ -116,7 +117,7 @@ def _enlarge(
 
 
 def find_layout_around(
-    occupied: Shape,
+    occupied: Occupied,
     shapes: Sequence[Shape],
     size: tuple[int, int],
     padding: float,
@@ -129,8 +130,8 @@ def find_layout_around(
 
     Parameters
     ----------
-    occupied : Shape
-        What is in the tiles, in texels. Tile ``k`` starts at ``(k % 10, k // 10)`` times ``size``.
+    occupied : Occupied
+        What is in the tiles.
     shapes, size, padding, tiles, rotate, scale
         See `find_layout`.
 
@@ -139,9 +140,13 @@ def find_layout_around(
     Layout
         None if the shapes do not fit.
     """
+    free = occupied.free_area(tiles, padding)
+    sides = np.sqrt([shape.area for shape in shapes])
 
     def place(scale: float) -> Layout | None:
-        if not _may_fit(shapes, size, tiles, scale):
+        # With half the padding around it, a shape covers at least this area, by the Brunn–Minkowski inequality.
+        least = float(((scale * sides + sqrt(pi) * padding / 2) ** 2).sum())
+        if least > free or not _may_fit(shapes, size, tiles, scale):
             return None
         for finer in _TUNING.finer:
             search = BitmapSearch(shapes, size, padding, tiles, scale, rotate=rotate, occupied=occupied, finer=finer)
@@ -153,10 +158,12 @@ def find_layout_around(
         return place(scale)
     high = max(size) * max(1.0, sqrt(tiles)) / min(sum(shape.area for shape in shapes) ** 0.5, 1 / least_scale(shapes))
     best, low = None, high
+    longest = max(max(shape.extent(shape.direction)) for shape in shapes)
     for _ in range(_HALVINGS):
         high, low = low, low / 2
         best = place(low)
-        if best is not None:
+        # Smaller charts need hardly less room if the padding is larger than they are.
+        if best is not None or low * longest < min(1.0, padding):
             break
     for _ in range(_BISECTIONS if best is not None else 0):
         middle = sqrt(low * high)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, Layout
+from quasiharmonic.apps.atlas.packing.board import Occupied
 from quasiharmonic.apps.atlas.packing.layout import (
     MAX_SIZE,
     find_layout,
@@ -174,6 +175,7 @@ def pack_charts(
     rounding = 2.0**-22
     pairs = _check_charts(charts)
     size = check_texture(resolution, padding, texels_per_unit, tiles, rotate, stack)
+    check_integer("closely", closely, minimum=0)
     if kinds is not None and len(kinds) != len(pairs):
         raise ValueError(
             f"kinds must have {count_of('number', 'numbers', len(pairs))}, one per chart, not {len(kinds)}"
@@ -197,10 +199,10 @@ def pack_charts(
         )
     if occupied is not None:
         at = map_array("occupied", occupied[0])
-        shape = make_shape(at * size, triangle_array(occupied[1], len(at)))
-        layout = find_layout_around(shape, shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+        around = Occupied(make_shape(at * size, triangle_array(occupied[1], len(at))), size)
+        layout = find_layout_around(around, shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
         if layout is None:
-            largest = find_layout_around(shape, shapes, size, spaced, tiles, rotate=rotate, scale=None)
+            largest = find_layout_around(around, shapes, size, spaced, tiles, rotate=rotate, scale=None)
             density = None if largest is None else float(np.ldexp(largest.scale, -exponent))
             raise ValueError(
                 f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels "

@@ -23,6 +23,8 @@ from quasiharmonic.util.options import INSTANCES
 PLACES = "TEXCOORD_0"
 # Modes of a glTF primitive.
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+# Volumes with a smaller ratio are equal, up to rounding.
+_LARGER = 1 + 1e-9
 _READ = "POSITION", "NORMAL", "COLOR_0", PLACES
 
 
@@ -333,7 +335,10 @@ def _separate_instances(tree: dict[str, Any]) -> None:
 
 
 def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
-    """Return the transformation (4, 4) of each mesh in the scene by its first node, without identities."""
+    """Return the transformation (4, 4) of each mesh in the scene, without identities.
+
+    Of several nodes, the one at which the mesh is largest counts, so that its texel density suffices for all.
+    """
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes", [])
     roots = scenes[whole(tree.get("scene", 0))].get("nodes", []) if scenes else []
@@ -349,9 +354,16 @@ def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
         here = above @ _local_matrix(node, index)
         if "mesh" in node:
             # The transformation of a node with a skin is ignored, as glTF specifies.
-            placed.setdefault(whole(node["mesh"]), np.eye(4) if "skin" in node else here)
+            matrix, mesh = np.eye(4) if "skin" in node else here, whole(node["mesh"])
+            if mesh not in placed or _volume(matrix) > _LARGER * _volume(placed[mesh]):
+                placed[mesh] = matrix
         waiting += [(whole(child), here) for child in reversed(node.get("children", []))]
     return {mesh: matrix for mesh, matrix in placed.items() if not np.array_equal(matrix, np.eye(4))}
+
+
+def _volume(matrix: FloatArray) -> float:
+    """Return the factor on volumes of a transformation (4, 4)."""
+    return abs(float(np.linalg.det(matrix[:3, :3])))
 
 
 def _local_matrix(node: dict[str, Any], index: int) -> FloatArray:

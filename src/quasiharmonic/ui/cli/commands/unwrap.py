@@ -75,8 +75,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         instances=choice(
             INSTANCES,
             "whether all occurrences of a mesh in a glTF file share their texture coordinates, or each becomes a mesh "
-            "of its own (default: share)",
-            default="share",
+            "of its own (default: share, with --lightmap own)",
         ),
         keep_seams=flag("keep the seams of the input's texture coordinates (vt), and add seams only where necessary"),
         edge_costs=file(
@@ -128,8 +127,8 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError("images are shown by the first texture coordinates: omit --bake and --texture, or --channel")
     if options.bake:
         _check_bake(options)
-    if options.lightmap and options.input.suffix.lower() in (".glb", ".gltf"):
-        options.instances = "own"
+    if options.lightmap and options.instances == "share":
+        raise ValueError("a lightmap gives each occurrence of a mesh a place of its own: omit --instances share")
     return pipeline.change_map(
         options,
         lambda mesh: _unwrap(options, mesh, began),
@@ -143,14 +142,16 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
     from quasiharmonic.io.formats.gltf.reader import read_gltf
     from quasiharmonic.io.untrusted import use_bound
 
+    has_instances = source.suffix.lower() in (".glb", ".gltf")
     with use_bound(options.memory):
-        if options.instances == "share":
-            return pipeline.read_mesh(options, source)
-        if source.suffix.lower() not in (".glb", ".gltf"):
+        if options.instances == "own" and not has_instances:
             raise ValueError(f"{source} has no instances: omit --instances, or give a glTF file")
+        if not has_instances or (options.instances != "own" and not options.lightmap):
+            return pipeline.read_mesh(options, source)
         if options.texture is not None:
-            raise ValueError("--texture makes one material for all meshes: omit --instances")
-        return read_gltf(source, instances=options.instances)
+            word = "--lightmap" if options.lightmap else "--instances"
+            raise ValueError(f"--texture makes one material for all meshes: omit --texture or {word}")
+        return read_gltf(source, instances="own")
 
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
@@ -162,7 +163,6 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         find_hard_edges,
         is_written,
         material_densities,
-        statement_labels,
     )
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.io.errors import printable_path
@@ -181,7 +181,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             edge_costs=_edge_costs(mesh, options.edge_costs),
             hard_edges=find_hard_edges(mesh) if options.hard_edges == "file" else options.hard_edges,
             meshes=None if mesh.carried is None else mesh.carried.number_meshes(),
-            tile_by=None if options.tile_by is None else statement_labels(mesh, "usemtl"),
+            tile_by=None if options.tile_by is None else _labels(mesh, "materials", "--tile-by"),
             seams=_read_integers(options.seams, 2),
             no_seams=_read_integers(options.no_seams, 2),
             labels=_labels(mesh, options.labels),
@@ -298,8 +298,8 @@ def _labels_file(which: str | None) -> Path | None:
     return None if which in (None, "groups", "materials") else Path(str(which))
 
 
-def _labels(mesh: MeshData, which: str | None) -> Any:
-    """Return the labels (f,) of the triangles that ``--labels`` names."""
+def _labels(mesh: MeshData, which: str | None, option: str = "--labels") -> Any:
+    """Return the labels (f,) of the triangles that an option names."""
     from quasiharmonic.apps.unwrapping.model_files import label_statements, statement_labels
     from quasiharmonic.util.arrays import count_of
 
@@ -308,7 +308,8 @@ def _labels(mesh: MeshData, which: str | None) -> Any:
     if (path := _labels_file(which)) is None:
         keywords = {"groups": ("o", "g"), "materials": ("usemtl",)}[which]
         if not any(label_statements(mesh, keyword)[1] for keyword in keywords):
-            raise ValueError(f"the file has no {which}: omit --labels, or give a file with the part of each face")
+            other = ", or give a file with the part of each face" if option == "--labels" else ""
+            raise ValueError(f"the file has no {which}: omit {option}{other}")
         return statement_labels(mesh, *keywords)
     labels = _read_integers(path, 1)[:, 0]
     if len(labels) != mesh.faces:
