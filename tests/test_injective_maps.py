@@ -99,7 +99,7 @@ class TestAgreement:
             np.testing.assert_array_equal(result.uv[fixed], target)
 
     def test_the_number_of_threads_does_not_matter(self, monkeypatch):
-        monkeypatch.setattr(many, "GROUP", 500)
+        monkeypatch.setattr(many, "MAX_BATCH", 500)
         problems = [*ellipses(12), star_problem(n=150), turned_ring(40)]
         one, other = (list(injective_maps(problems, jobs=jobs)) for jobs in (1, 3))
         for a, b in zip(one, other, strict=True):
@@ -109,7 +109,7 @@ class TestAgreement:
     @pytest.mark.slow
     def test_merged_groups_continue_as_they_would_alone(self, monkeypatch):
         """Some problems of several groups, of one mesh or of many, remain after the first iterations."""
-        monkeypatch.setattr(first_stage, "GROUP", 900)
+        monkeypatch.setattr(first_stage, "MAX_BATCH", 900)
         stars = [star_problem(depth=0.15, points=6, n=150, seed=seed) for seed in range(5)]
         V, F, fixed, target = stars[0]
         turned = [(V, F, fixed, target * [1, 0.5 + k / 10]) for k in range(5)]
@@ -133,7 +133,7 @@ class TestAgreement:
     def test_larger_portions_preserve_their_order(self, monkeypatch):
         """A call takes increasing portions; 60 groups exceed the first ones, which are taken one by one."""
         for module in (many, first_stage):
-            monkeypatch.setattr(module, "GROUP", 60)
+            monkeypatch.setattr(module, "MAX_BATCH", 60)
         V, F, fixed, target = ellipses(1, 2)[0]
         problems = [(V, F, fixed, target * [1, 0.3 + k / 100]) for k in range(60)]
         for (*_, held), result in zip(problems, injective_maps(problems, jobs=2), strict=True):
@@ -218,7 +218,7 @@ class TestAgreement:
 
         with monkeypatch.context() as patch:
             patch.setattr(Laplacian, "factor", defeated_once)
-            patch.setattr(first_stage, "GROUP", 2 * len(problems[0].F))
+            patch.setattr(first_stage, "MAX_BATCH", 2 * len(problems[0].F))
             found = run_first_stage(problems, VectorAdam(iterations=50), patterns, options)
         assert found[:2] == [None] * 2
         assert all(one.injective for one in found[2:])

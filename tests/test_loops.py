@@ -112,7 +112,7 @@ def test_floating_point_decides_all_triangles_on_a_lattice(rng):
 
 def test_floating_point_decides_all_pairs_of_segments_on_a_lattice(rng, monkeypatch):
     """Their determinants are small integers. So the pairs to examine are the pairs that meet."""
-    monkeypatch.setattr("quasiharmonic.geometry.exact.predicates.PAIR_CHUNK", 50)
+    monkeypatch.setattr("quasiharmonic.geometry.exact.box_pairs.PAIR_CHUNK", 50)
 
     def may_meet(i, j):
         ends = [places[k] for k in (tails[i], heads[i], tails[j], heads[j])]
@@ -155,7 +155,7 @@ def test_a_loop_with_more_uncertain_pairs_than_edges():
 @pytest.mark.parametrize("size", [3, 30])
 def test_contacts_in_several_portions_up_to_a_limit(size, rng, monkeypatch):
     """On a small lattice there are more uncertain pairs than segments, on a large one fewer."""
-    monkeypatch.setattr("quasiharmonic.geometry.exact.predicates.PAIR_CHUNK", 50)
+    monkeypatch.setattr("quasiharmonic.geometry.exact.box_pairs.PAIR_CHUNK", 50)
     for _ in range(3):
         tails = rng.integers(0, size, (40, 2))
         places = np.concatenate([tails, tails + rng.integers(-3, 4, (40, 2))]).astype(float)
@@ -176,7 +176,7 @@ def test_contacts_in_several_portions_up_to_a_limit(size, rng, monkeypatch):
 @pytest.mark.slow
 def test_simple_loops_in_several_portions(rng, monkeypatch):
     """Many loops, and one of them may have all the contacts of the first portion."""
-    monkeypatch.setattr("quasiharmonic.geometry.exact.predicates.PAIR_CHUNK", 20)
+    monkeypatch.setattr("quasiharmonic.geometry.exact.box_pairs.PAIR_CHUNK", 20)
     angle = np.arange(40) * np.pi / 20
     circle = np.round(99 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     seen = set()

@@ -8,12 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quasiharmonic.geometry.exact import predicates
+from quasiharmonic.geometry.exact.box_pairs import box_pairs, box_pairs_between, box_pairs_within
 from quasiharmonic.geometry.exact.predicates import (
     SegmentRelation,
-    box_pairs,
-    box_pairs_between,
-    box_pairs_within,
     orientation,
     orientation_or_nonfinite,
     segment_relation,
@@ -280,7 +277,7 @@ def test_box_pairs_within_groups(rng, starts, least):
 @pytest.mark.slow
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_are_those_that_intersect(rng, monkeypatch, chunk):
-    monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
+    monkeypatch.setattr("quasiharmonic.geometry.exact.box_pairs.PAIR_CHUNK", chunk)
     for count, dimension in itertools.product((0, 1, 2, 3, 8, 9, 57, 150), (2, 3)):
         lo = rng.integers(0, 20, (count, dimension)).astype(float)
         hi = lo + rng.integers(0, 5, (count, dimension))
@@ -298,7 +295,7 @@ def test_box_pairs_are_those_that_intersect(rng, monkeypatch, chunk):
 @pytest.mark.slow
 @pytest.mark.parametrize("chunk", [3, 1 << 17])
 def test_box_pairs_between_two_groups(rng, monkeypatch, chunk):
-    monkeypatch.setattr(predicates, "PAIR_CHUNK", chunk)
+    monkeypatch.setattr("quasiharmonic.geometry.exact.box_pairs.PAIR_CHUNK", chunk)
     sizes = ((0, 0), (0, 3), (1, 1), (5, 0), (9, 5), (5, 9), (3, 40), (57, 8), (150, 90))
     for (count, other), dimension in itertools.product(sizes, (2, 3)):
         lo, low = (rng.integers(0, 20, (number, dimension)).astype(float) for number in (count, other))

@@ -5,7 +5,7 @@ precision, and returned in single precision if all arguments are. Every argument
 derivatives are available in backward and forward mode. `torch.compile` breaks the graph at a map, and compiles the code
 around it. Transforms of `torch.func` are not supported and raise an error.
 
-All maps share one autograd function, `apply_layer`, and build on `apps.gradients.layers`.
+All maps share one autograd function, behind `apply_layer`, and build on `apps.gradients.layers`.
 """
 
 from __future__ import annotations

@@ -83,8 +83,8 @@ class EnergyCheck:
         Relative error of the curvature (with ``negative=1``) against differences of the gradient; NaN for an energy
         without curvature.
     indefinite : float
-        The most negative eigenvalue of the clamped curvature, relative to the largest. Newton's method needs a
-        semidefinite form, which gives 0 up to rounding. NaN for an energy without curvature.
+        Minus the least eigenvalue of the clamped curvature, relative to the largest. Newton's method needs a
+        semidefinite form, for which this is at most 0 up to rounding. NaN for an energy without curvature.
     """
 
     gradient: float

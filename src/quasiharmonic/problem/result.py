@@ -205,7 +205,7 @@ class Step:
     ----------
     iteration : int
     inverted : int
-        Triangles whose floating-point area is not positive.
+        Triangles whose area is not positive, in floating point; if there are none, verified exactly.
     energy : float
         V₃ divided by the target's area (dimensionless). It is 0 only at injective maps, and decreases towards them. In
         a polish, the mean energy.
@@ -262,7 +262,7 @@ class RefinementAttempt:
     Attributes
     ----------
     name : str
-        The mesh that was mapped: the given mesh, or which edges were split.
+        The mesh that was mapped: the given mesh, which edges were split, or that the map was constructed.
     added : int
         Number of added vertices, after the removal of those that the map did not need.
     injective : bool
@@ -404,7 +404,7 @@ class MapResult(ReadOnly, Displayable, Outcome):
 
     @property
     def energy(self) -> float:
-        """The minimised energy of the map: a mean over the rest area, 0 at isometries; NaN if none was computed.
+        """The minimised energy of the map: a mean over the rest area; NaN if none was computed.
 
         After a search without polish it is V₃ divided by the target's area, which is 0 only at injective maps. After
         `harmonise` it is the energy plus the conformal term. The energy of a class of the caller is reported unchanged.

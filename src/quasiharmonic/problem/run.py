@@ -1,8 +1,8 @@
 """The record of a call while it runs: history, stages, recorded maps, clock, and how it ends.
 
 A descent is an iterator: it changes its map and yields a status, or None, after every step. `Run.descend` takes the
-steps and records each. Ctrl-C is caught here and nowhere else in the library: code that keeps the work so far runs in
-`Run.until_interrupted`.
+steps and records each. Outside the command and the page, Ctrl-C is caught only here: code that keeps the work so far
+runs in `Run.until_interrupted`.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Run:
 
 
 def finish(compute: Callable[[], T]) -> tuple[T, bool]:
-    """Return what a computation returns that no result can do without, and whether an interrupt has repeated it.
+    """Run a computation that every result needs; return its value, and whether an interrupt made it run again.
 
     A second interrupt propagates.
     """

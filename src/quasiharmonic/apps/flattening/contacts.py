@@ -26,9 +26,9 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.energies.energies import QuadraticForm
+from quasiharmonic.geometry.exact.box_pairs import box_pairs_between
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops, contacts
-from quasiharmonic.geometry.exact.predicates import box_pairs_between
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, sum_at, to_complex, to_points
 
 

@@ -201,8 +201,8 @@ def keep_distances(V: ArrayLike, F: ArrayLike, uv: ArrayLike, **options: Unpack[
     The objective is a mean over a sample of vertex pairs at most ``rings`` edges apart. It is the distance error of
     `quasiharmonic.distortion`, except that errors below 30 % count quadratically. A small multiple of the symmetric
     Dirichlet energy keeps triangles from collapsing. With 20 rings, the sample has 2,500 vertices, or all if there are
-    fewer, with 120 others each. Fewer rings use up to 4,000 vertices, and more rings down to 1,000; there are 300,000
-    pairs in all. The sample is random but deterministic.
+    fewer, with 120 others each. Fewer rings use up to 4,000 vertices, and more rings down to 1,000; there are at
+    most 300,000 pairs in all. The sample is random but deterministic.
 
     Parameters
     ----------

@@ -156,7 +156,9 @@ def write_pattern(
 
 
 def check_pattern(path: str | os.PathLike[str], *, unit: str = "mm", allowance: float = 0.0) -> None:
-    """Check before mapping whether a pattern can be written; raises the same errors as `write_pattern`."""
+    """Check before mapping whether a pattern can be written; raises the errors of `write_pattern` that the map does not
+    cause.
+    """
     check_path("path", path)
     ending = _find_ending(path)
     if ending not in (".svg", ".dxf"):

@@ -28,9 +28,10 @@ from quasiharmonic.apps.flattening.flattening_run import Flattening
 from quasiharmonic.apps.flattening.piece import Piece, to_given_unit
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.polishing import find_energy
+from quasiharmonic.geometry.exact.box_pairs import box_pairs_between
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.loops import contacts
-from quasiharmonic.geometry.exact.predicates import box_pairs_between, orientation
+from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.splitting import split_edges
 from quasiharmonic.geometry.mesh.topology import Edges, edge_keys, edges, pair_keys
 from quasiharmonic.problem import Problem

@@ -1,46 +1,41 @@
 """Positions of the mid-side nodes of six-node triangles: they follow their sides, or move aside for valid elements.
 
-Quadrilaterals stay convex: the triangles at all four corners, from both diagonals, must be positive.
+An element is valid if its Jacobian determinant is positive everywhere. That is certain if its control values, the
+coefficients of the determinant in the Bernstein basis, are positive.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.curves.curve import Curve
-from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
 from quasiharmonic.geometry.mesh.elements import FORMS, MIDDLES, SIDES, jacobian_coefficients
-from quasiharmonic.problem import Problem
-from quasiharmonic.problem.result import MapResult, Status
-from quasiharmonic.problem.run import Run
-from quasiharmonic.solver.methods.untangling import untangle
-from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, invert_indices, to_complex, to_points
+from quasiharmonic.util.arrays import FloatArray, IntArray, invert_indices, to_complex, to_points
 
 
 class MidsideTuning(NamedTuple):
     """Numbers that tune the tries for mid-side nodes."""
 
-    # Required least control value of an inverted element, relative to that of the triangle of its corners.
+    # Required least control value of every element with a movable node, relative to that of the triangle of its
+    # corners.
     margin: float = 0.1
-    # Weight of displacements in the first try; each further try has a tenth of it.
+    # Weight of displacements in the first try, and its factor from each try to the next.
     displacement_weight: float = 1e-2
+    weight_factor: float = 0.1
     max_tries: int = 8
     # Steps per try.
     steps: int = 30
+    # Lengths tried per step: the full step, then half of the previous length each time.
+    step_lengths: int = 6
     # Attempts in order. First value: rings of elements around inverted ones whose nodes move; None moves only mid-side
     # nodes of inverted elements. Second value: initial positions, as a fraction of the way from ``straight`` to
     # ``searched``. Further attempts start from the best result.
     attempts: tuple[tuple[int | None, float], ...] = (None, 0.0), (0, 0.0), (1, 0.0), (3, 0.0), (3, 0.5), (3, 1.0)
     further: tuple[int, ...] = (1, 2, 4, 8)
-    # Maximum number of untangling steps; successful runs need a few dozen.
-    corner_steps: int = 300
 
 
 _TUNING = MidsideTuning()
@@ -143,7 +138,7 @@ def _move_nodes(F: IntArray, points: FloatArray, free: IntArray) -> FloatArray:
             now[free] += step
         if not inverted_elements(near, now).size:
             break
-        weight *= 0.1
+        weight *= _TUNING.weight_factor
     return now
 
 
@@ -202,41 +197,9 @@ class _Displacement:
         except RuntimeError:  # singular: in very bad elements the weight is lost to rounding
             return None
         there, before = now.copy(), self._value(now, weight)
-        for halving in range(6):
+        for halving in range(_TUNING.step_lengths):
             step = 0.5**halving * self._size * direction
             there[self._free] = now[self._free] + step
             if self._value(there, weight) < before:
                 return np.asarray(step)
         return None
-
-
-def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linear_solver: str) -> MapResult:
-    """Continue from a map of triangles that halve quadrilaterals to one in which these are convex.
-
-    The quadrilaterals are convex in the rest mesh, and ``corners`` (t, 3) are the triangles at all their corners. The
-    result has an additional stage if steps were taken. Its status is `Status.STALLED` if corners stay inverted; the map
-    then has the fewest inverted corners found.
-    """
-    before = inverted_triangles(corners, result.uv).size
-    if not before:
-        return result
-    run, steps = Run(), 0
-    exponent = find_exponent(result.uv)
-    w = in_units(result.uv, exponent)
-    areas = (signed_areas(problem.F, places).sum() for places in (w, in_units(problem.V, 0)))
-    rest = problem.V * np.sqrt(np.divide(*areas))
-    for further in untangle(corners, w, problem.fixed, rest=rest, linear_solver=linear_solver):
-        w, steps = further, steps + 1
-        if steps == _TUNING.corner_steps:
-            break
-    uv = np.ldexp(to_points(w), exponent)
-    uv[problem.fixed] = problem.target
-    after = inverted_triangles(corners, uv).size
-    name, inverted, energy = "untangling corners", (before, after), (np.inf, np.inf)
-    run.add_stage(name, n_iterations=steps, inverted=inverted, energy=energy, kept=after < before)
-    result = replace(result, stages=result.stages + run.stages, seconds=result.seconds + run.seconds)
-    if after >= before:
-        return replace(result, status=Status.STALLED)
-    certificate = certify(problem.F, uv, loops=problem.domain.loops)
-    status = Status.STALLED if after else Status.INJECTIVE
-    return replace(result, uv=uv, status=status, certificate=certificate, diagnosis=None, mu=None)

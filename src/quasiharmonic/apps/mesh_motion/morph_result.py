@@ -36,9 +36,9 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         Inverted elements that are inverted by nodes with given positions alone; no placement of the other nodes can
         untangle them.
     result : MapResult
-        The search: status, certificate, stages, seconds. Its ``uv`` has the nodes that elements use, in their order.
-        Its triangles cover the elements: two per quadrilateral, four per six-node triangle, whose mid-side nodes are
-        placed afterwards.
+        The search: status, certificate, stages, seconds. Its ``uv`` has the nodes of the triangles that were searched,
+        in their order. There are two triangles per quadrilateral. A six-node triangle is searched by its corners, and
+        its mid-side nodes are placed afterwards; if that fails, as four triangles with all nodes.
     quality_before, quality_after : (f,) float64
         `quasiharmonic.apps.mesh_motion.quality.element_quality` of every element: 1 for an equilateral triangle or a
         square, 0 without area, negative if inverted.
@@ -141,7 +141,11 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
 
 
 def find_forbidden(F: IntArray, points: FloatArray, given: IntArray) -> IntArray:
-    """Return elements inverted or degenerate at a corner whose relevant nodes all have given positions; ascending."""
+    """Return elements that are inverted at a corner whose relevant nodes all have given positions; ascending.
+
+    Elements with straight sides that are degenerate there are returned, too; those with mid-side nodes are judged in
+    floating point.
+    """
     known = mark(len(points), given)
     if F.shape[1] == 6:
         x, y = (points[F] - points[F[:, :1]]).transpose(2, 0, 1)

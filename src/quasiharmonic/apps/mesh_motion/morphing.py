@@ -10,11 +10,11 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.mesh_motion.convex_quadrilaterals import make_convex
 from quasiharmonic.apps.mesh_motion.midsides import (
     centre_midsides,
     find_sides,
     follow_sides,
-    make_convex,
     restore_midsides,
     untangle_elements,
 )

@@ -23,7 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.tetrahedra.elements import ExactSigns, SignArray
-from quasiharmonic.geometry.exact.predicates import box_pairs, box_pairs_between, orientation
+from quasiharmonic.geometry.exact.box_pairs import box_pairs, box_pairs_between
+from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, morton_order
 from quasiharmonic.util.progress import heartbeat
 

@@ -13,8 +13,9 @@ derivatives of D(J) are a positive semidefinite matrix. Newton's method uses thi
 derivative in D raised where it would be indefinite.
 
 Conjugate gradients with the diagonal blocks as preconditioner solve the systems, because a factorisation of a mesh in
-space fills in. Untangling lowers the regularised energy, and the regularisation parameter after each step, until no
-tetrahedron is inverted. Polishing lowers the energy without regularisation, which is infinite at inverted tetrahedra.
+space fills in. Untangling lowers the regularised energy until no tetrahedron is inverted. It lowers the regularisation
+parameter between steps, but not while steps lower the energy quickly. Polishing lowers the energy without
+regularisation, which is infinite at inverted tetrahedra.
 
 References
 ----------
@@ -25,38 +26,34 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from quasiharmonic.apps.tetrahedra.block_matrix import VERTEX_PAIRS, BlockMatrix
 from quasiharmonic.energies.newton.line_search import backtrack
-from quasiharmonic.util.arrays import FloatArray, IntArray, invert_indices
+from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
-if TYPE_CHECKING:
-    from scipy.sparse import bsr_array
 
-
-class VolumeDescentTuning(NamedTuple):
-    """Numbers that tune the descent of the volume energy."""
+class TetrahedraDescentTuning(NamedTuple):
+    """Numbers that tune the energy of tetrahedra and its descent."""
 
     # Share of the volume term in the density.
     volume_share: float = 0.5
-    # Relative residual of the linear systems, and maximum number of iterations.
+    # Residual at which conjugate gradients end, relative to the initial one, both in the norm of the preconditioner.
     residual: float = 0.05
+    # Maximum number of iterations of conjugate gradients per Newton step.
     max_conjugate_steps: int = 250
-    # The regularisation parameter is kept after a step that lowers the energy by more than this share, but not more
-    # often.
+    # The regularisation parameter is kept after a quick step, which lowers the energy by at least this share.
     quick_decrease: float = 0.1
+    # Maximum number of successive quick steps after which the parameter is kept; it is lowered after the next step.
     max_repeated: int = 10
     # Least regularisation parameter; determinants are about 1.
     min_epsilon: float = 1e-14
 
 
-_TUNING = VolumeDescentTuning()
-
-# Pairs of vertices of a tetrahedron whose blocks are computed; the others are their transposes.
-_PAIRS = tuple((i, j) for i in range(4) for j in range(i, 4))
+_TUNING = TetrahedraDescentTuning()
 
 
 class _Density(NamedTuple):
@@ -101,10 +98,11 @@ class ShapeEnergy:
     def __init__(self, T: IntArray, rest: FloatArray, floor: float = 0.0) -> None:
         self.T, self.n, self.floor = T, len(rest), floor
         u, v, w = (np.ascontiguousarray((rest[T[:, k]] - rest[T[:, 0]]).T) for k in (1, 2, 3))
-        volume = dot(u, cross(v, w))
-        # Gradients of the four linear basis functions, and six times the volumes at rest.
-        one, two, three = cross(v, w) / volume, cross(w, u) / volume, cross(u, v) / volume
-        self.gradients, self.volumes = np.stack([-(one + two + three), one, two, three]), volume
+        # Six times the volumes at rest, (t,).
+        self.six_volumes = dot(u, cross(v, w))
+        one, two, three = (normal / self.six_volumes for normal in (cross(v, w), cross(w, u), cross(u, v)))
+        # Gradients of the four linear basis functions, (4, 3, t).
+        self.gradients = np.stack([-(one + two + three), one, two, three])
 
     def jacobians(self, X: FloatArray) -> FloatArray:
         """Return the Jacobian matrices, (3, 3, t)."""
@@ -129,7 +127,7 @@ class ShapeEnergy:
         return int(np.count_nonzero(~(self.determinants(X) > 0)))
 
     def value(self, X: FloatArray, epsilon: float) -> float:
-        """Return the energy per tetrahedron; infinite if ε is 0 and a tetrahedron is not positive."""
+        """Return the energy per tetrahedron; infinite if ε is 0 and a determinant is not above the floor."""
         J = self.jacobians(X)
         D = dot(J[0], cross(J[1], J[2]))
         if epsilon == 0 and not D.min() > self.floor:
@@ -141,7 +139,7 @@ class ShapeEnergy:
         return value if np.isfinite(value) else np.inf
 
     def densities(self, X: FloatArray) -> FloatArray:
-        """Return the density of every tetrahedron, (t,), with ε = 0; infinite if it is not positive."""
+        """Return the densities (t,) with ε = 0; infinite where the determinant is not above the floor."""
         J = self.jacobians(X)
         D = dot(J[0], cross(J[1], J[2]))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -154,7 +152,7 @@ class ShapeEnergy:
         a, b = (1 - _TUNING.volume_share) / 3, _TUNING.volume_share / 2
         shape = a * np.cbrt(chi) ** -2
         g = b * (D * D + 1) / chi
-        # First and second derivative of χ, relative to χ.
+        # First and second derivative of χ, relative to χ. The first derivative is χ / root.
         slope = chi / root / chi
         bend = 0.5 * (epsilon / root) ** 2 / root / chi
         by_d_d = (
@@ -181,9 +179,9 @@ class ShapeEnergy:
         cofactors = np.stack([cross(J[1], J[2]), cross(J[2], J[0]), cross(J[0], J[1])])
         d = self._density(J, dot(J[0], cofactors[0]), epsilon)
         along, across = (np.einsum("abt,ibt->iat", matrix, G) for matrix in (J, cofactors))
-        blocks = np.empty((len(_PAIRS), 3, 3, count))
+        blocks = np.empty((len(VERTEX_PAIRS), 3, 3, count))
         mixed = 2 * d.by_t_d / count * along + 0.5 * d.by_d_d / count * across
-        for k, (i, j) in enumerate(_PAIRS):
+        for k, (i, j) in enumerate(VERTEX_PAIRS):
             diagonal = 2 * d.by_t / count * dot(G[i], G[j])
             for a in range(3):
                 for b in range(3):
@@ -193,47 +191,6 @@ class ShapeEnergy:
         force, vertex = (2 * d.by_t * along + d.by_d * across) / count, self.T.T.ravel()
         gradient = [np.bincount(vertex, force[:, a].ravel(), minlength=self.n) for a in range(3)]
         return float(d.value.mean()), np.stack(gradient, axis=1), blocks
-
-
-class BlockMatrix:
-    """Assembles blocks of pairs of vertices into a sparse matrix of the free coordinates.
-
-    ``free`` (k,) are the free vertices; unknown ``3 i + a`` is coordinate a of vertex ``free[i]``.
-    """
-
-    def __init__(self, T: IntArray, n: int, free: IntArray) -> None:
-        number = invert_indices(n, free)
-        own = number[T]
-        rows = np.concatenate([own[:, i] for i, _ in _PAIRS] + [own[:, j] for i, j in _PAIRS if i != j])
-        columns = np.concatenate([own[:, j] for _, j in _PAIRS] + [own[:, i] for i, j in _PAIRS if i != j])
-        inside = (rows >= 0) & (columns >= 0)
-        key = np.where(inside, rows * free.size + columns, -1)
-        entries, place = np.unique(key, return_inverse=True)
-        outside = int(entries.size > 0 and entries[0] < 0)
-        self._place = place.ravel() - outside
-        self._size = free.size
-        self._count = entries.size - outside
-        row, self._indices = np.divmod(entries[outside:], max(free.size, 1))
-        self._indptr = np.searchsorted(row, np.arange(free.size + 1))
-        self.diagonal = np.flatnonzero(row == self._indices)
-
-    def assemble(self, blocks: FloatArray) -> FloatArray:
-        """Return the blocks (m, 3, 3) of the matrix of blocks (10, 3, 3, t)."""
-        off = [k for k, (i, j) in enumerate(_PAIRS) if i != j]
-        data = np.empty((self._count, 3, 3))
-        place = self._place + 1
-        for a in range(3):
-            for b in range(3):
-                weights = np.concatenate([blocks[:, a, b].ravel(), blocks[off, b, a].ravel()])
-                data[:, a, b] = np.bincount(place, weights, minlength=self._count + 1)[1:]
-        return data
-
-    def matrix(self, data: FloatArray) -> bsr_array[np.float64]:
-        """Return the sparse matrix of assembled blocks."""
-        from scipy.sparse import bsr_array
-
-        size = 3 * self._size
-        return bsr_array((data, self._indices, self._indptr), shape=(size, size))
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -273,15 +230,18 @@ class TetrahedraDescent:
         self.converged = False
 
     def untangle(self, max_steps: int) -> Iterator[float]:
-        """Lower the regularised energy; yield the least determinant after each step, and end when it is positive."""
-        # Determinants are about 1.
+        """Lower the regularised energy; yield after each step how far the least determinant is above the floor.
+
+        The value is negative if the least determinant is below the floor. The descent ends when it is positive.
+        """
+        # Determinants are about 1, so this parameter smooths the energy strongly.
         epsilon, repeated = 1.0, 0
         for _ in range(max_steps):
             before = self._value(self.X, epsilon)
             after = self._step(epsilon)
             least = float(self.energy.determinants(self.X).min()) - self.energy.floor
             yield least
-            if least > 0 or (after is None and epsilon < _TUNING.min_epsilon):
+            if least > 0 or (after is None and epsilon <= _TUNING.min_epsilon):
                 return
             ratio = 1.0 if after is None else after / before
             # While the energy falls quickly, keep the parameter. Lowering it too early leads to worse local minima.
@@ -301,7 +261,7 @@ class TetrahedraDescent:
         return bool(self.energy.determinants(self.X).min() > self.energy.floor)
 
     def polish(self, max_steps: int, tol: float) -> Iterator[float]:
-        """Lower the energy of positive tetrahedra; yield it after each step, and end when it has converged."""
+        """Lower the energy with ε = 0 of a valid mesh; yield it after each step, and end when it has converged."""
         before = self._value(self.X, 0.0)
         for _ in range(max_steps):
             after = self._step(0.0)
@@ -360,6 +320,7 @@ class TetrahedraDescent:
         matrix = self._blocks.matrix(data)
         diagonal = data[self._blocks.diagonal]
         scale = np.trace(diagonal, axis1=1, axis2=2)
+        # This shift makes every block invertible, also one that is singular after rounding or underflow.
         shift = 1e-12 * np.where(scale > 0, scale, 1.0)
         if self.projections is not None:
             # Directions in which a vertex cannot move get a unit of the block's own size.

@@ -324,7 +324,7 @@ def extend_harmonically(
     n = len(X)
     displacement = np.zeros_like(X)
     displacement[fixed] = target - X[fixed]
-    stiffness = np.einsum("iat,jat->ijt", G, G) * energy.volumes
+    stiffness = np.einsum("iat,jat->ijt", G, G) * energy.six_volumes
     rows, columns = np.broadcast_arrays(T.T[:, None], T.T[None])
     matrix = coo_array((stiffness.ravel(), (rows.ravel(), columns.ravel())), shape=(n, n)).tocsr()
     free = np.setdiff1d(np.unique(T), fixed)

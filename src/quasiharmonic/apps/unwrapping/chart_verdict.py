@@ -17,9 +17,9 @@ from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
 from quasiharmonic.apps.unwrapping.layout import ChartLayout
 from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.geometry.exact import certificate
+from quasiharmonic.geometry.exact.box_pairs import box_pairs
 from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.loops import LoopEdges, Obstacle
-from quasiharmonic.geometry.exact.predicates import box_pairs
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_twins, group_by_label, label_components
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of, repeat_each

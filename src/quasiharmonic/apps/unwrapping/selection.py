@@ -1,4 +1,4 @@
-"""Unwrap some triangles of a model only: their part of the cleaned mesh, and the charts of the others, which stay."""
+"""Parts of a cleaned mesh, such as the triangles to unwrap, and the charts of the other triangles, which stay."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def select(cleaned: CleanedMesh, chosen: BoolArray, apart: IntArray | None = Non
     """Return the part of a cleaned mesh with the chosen triangles (f,) of the model.
 
     It is cut between triangles with different numbers ``apart`` (f,). Its vertices are split where the part only
-    touches itself. What concerns the model stays.
+    touches itself. Attributes that refer to the whole model are unchanged.
     """
     rows = np.flatnonzero(chosen[cleaned.triangles])
     if not rows.size:
@@ -87,7 +87,8 @@ class KeptCharts:
     layout : ChartLayout
         Their charts. Parts of one chart that are not connected any more count as one.
     before : ChartLayout
-        The charts including what is replaced.
+        The charts including what is replaced. Its first `count` charts are those of ``layout``, with the same numbers;
+        charts that are replaced completely follow.
     triangles : (l,) int64
         Triangles of the model in ``before``.
     """
@@ -122,7 +123,7 @@ class KeptCharts:
 
     def join(self, new: ChartLayout, cleaned: CleanedMesh) -> ChartLayout:
         """Return the layout of all charts of a cleaned mesh, new ones first."""
-        mine, theirs = self.rows, np.flatnonzero(self.replaced[cleaned.triangles])
+        stay, replaced = self.rows, np.flatnonzero(self.replaced[cleaned.triangles])
         kept, count = self.layout, len(cleaned.F)
         joined = ChartLayout(
             np.empty((count, 3), dtype=np.int64),
@@ -130,9 +131,9 @@ class KeptCharts:
             np.empty(count, dtype=np.int64),
             np.empty(count, dtype=np.bool_),
         )
-        joined.rows[theirs], joined.rows[mine] = new.rows, kept.rows + len(new.uv)
-        joined.chart[theirs], joined.chart[mine] = new.chart, kept.chart + int(new.chart.max()) + 1
-        joined.mirrored[theirs], joined.mirrored[mine] = new.mirrored, kept.mirrored
+        joined.rows[replaced], joined.rows[stay] = new.rows, kept.rows + len(new.uv)
+        joined.chart[replaced], joined.chart[stay] = new.chart, kept.chart + int(new.chart.max()) + 1
+        joined.mirrored[replaced], joined.mirrored[stay] = new.mirrored, kept.mirrored
         return joined
 
     def certify(

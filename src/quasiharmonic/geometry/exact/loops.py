@@ -12,9 +12,9 @@ from enum import StrEnum
 
 import numpy as np
 
+from quasiharmonic.geometry.exact.box_pairs import box_pairs_within
 from quasiharmonic.geometry.exact.predicates import (
     SegmentRelation,
-    box_pairs_within,
     orientation,
     segment_relation,
     sure_orientation,

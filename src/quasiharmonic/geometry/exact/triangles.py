@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.predicates import box_pairs, orientation, orientation_or_nonfinite, sure_orientation
+from quasiharmonic.geometry.exact.box_pairs import box_pairs
+from quasiharmonic.geometry.exact.predicates import orientation, orientation_or_nonfinite, sure_orientation
 from quasiharmonic.geometry.mesh.polygons import Polygons
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, check_range, repeat_each
 from quasiharmonic.util.kernels import compiled

@@ -10,7 +10,9 @@ from typing import TypeAlias
 import numpy as np
 
 from quasiharmonic.geometry.mesh.elements import join_elements, join_solids
-from quasiharmonic.io.fem.mesh_parts import SUPPORTED, MeshParts, Table, TableReader, replace_numbers, stack_tables
+from quasiharmonic.io.fem.mesh_parts import MeshParts
+from quasiharmonic.io.fem.number_tables import Table, TableReader, replace_numbers, stack_tables
+from quasiharmonic.io.fem.vtk_cells import SUPPORTED
 from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -61,8 +63,8 @@ def read_gmsh(data: bytes, solid: bool = False) -> MeshParts:
             spans[name] = begin, end
         elif name == b"NodeData":
             title = TableReader(data, begin, end, "<")
-            if int(title.words()[0]) > 0:
-                later.setdefault(title.line().strip(b'"').decode("utf-8", "replace"), []).append((begin, end))
+            if int(title.read_words()[0]) > 0:
+                later.setdefault(title.read_line().strip(b'"').decode("utf-8", "replace"), []).append((begin, end))
     if not (nodes and elements):
         raise ValueError(f"there is no section ${'Elements' if nodes else 'Nodes'}")
     tags, numbers = nodes[0][0], elements[0]
@@ -100,8 +102,8 @@ def _format(data: bytes) -> tuple[str, str | None, int]:
     """Return the version ("2", "4.0" or "4.1"), the byte order (None for text), and the end of the section."""
     begin = data.find(b"$MeshFormat")
     reader = TableReader(data, max(begin, 0), len(data), "<")
-    reader.line()
-    words = reader.words()
+    reader.read_line()
+    words = reader.read_words()
     if begin < 0 or len(words) != 3:
         raise ValueError("it does not start like an MSH file of version 2 or 4")
     version = words[0].decode("ascii", "replace")
@@ -136,22 +138,22 @@ def _nodes(data: bytes, begin: int, end: int, version: str, order: str | None) -
     """Return the tags of nodes and the table of their positions."""
     if version == "2":
         head = TableReader(data, begin, end, "<")
-        count = int(head.words()[0])
-        tags, place = TableReader(data, head.position, end, order).tables(count, ("i4", 1), ("f8", 3))
+        count = int(head.read_words()[0])
+        tags, place = TableReader(data, head.position, end, order).read_tables(count, ("i4", 1), ("f8", 3))
         return tags.values[:, 0].astype(np.int64), place
     reader = TableReader(data, begin, end, order)
-    blocks = int(reader.take("u8", 2 if version == "4.0" else 4)[0])
+    blocks = int(reader.read_numbers("u8", 2 if version == "4.0" else 4)[0])
     numbers, values = [np.empty(0, dtype=np.int64)], []
     for _ in range(blocks):
-        first, second, parametric = reader.take("i4", 3).tolist()
-        count = int(reader.take("u8", 1)[0])
+        first, second, parametric = reader.read_numbers("i4", 3).tolist()
+        count = int(reader.read_numbers("u8", 1)[0])
         # The parameters of a node on its curve or surface may follow its position.
         width = 3 + (parametric and (first if version == "4.1" else second))
         if version == "4.1":
-            numbers.append(reader.take("u8", count).astype(np.int64))
-            values += reader.tables(count, ("f8", width))
+            numbers.append(reader.read_numbers("u8", count).astype(np.int64))
+            values += reader.read_tables(count, ("f8", width))
         else:
-            tags, place = reader.tables(count, ("i4", 1), ("f8", width))
+            tags, place = reader.read_tables(count, ("i4", 1), ("f8", width))
             numbers.append(tags.values[:, 0].astype(np.int64))
             values.append(place)
     if not values:
@@ -163,25 +165,25 @@ def _blocks(data: bytes, begin: int, end: int, version: str, order: str | None, 
     """Yield the blocks of elements, of all kinds."""
     if version == "2":
         head = TableReader(data, begin, end, "<")
-        count = int(head.words()[0])
+        count = int(head.read_words()[0])
         if order is None:
             yield from _element_lines(list(map(int, data[head.position : end].split())), count, solid)
             return
         reader = TableReader(data, head.position, end, order)
     else:
         reader = TableReader(data, begin, end, order)
-        count = int(reader.take("u8", 2 if version == "4.0" else 4)[0])
+        count = int(reader.read_numbers("u8", 2 if version == "4.0" else 4)[0])
     while count > 0:
         # In version 2, tags of the element follow its number; it counts the elements, version 4 their blocks.
         if version == "2":
-            kind, size, tags = reader.take("i4", 3).tolist()
+            kind, size, tags = reader.read_numbers("i4", 3).tolist()
             group = 0
         else:
-            first, second, kind = reader.take("i4", 3).tolist()
+            first, second, kind = reader.read_numbers("i4", 3).tolist()
             group = second if version == "4.1" else first
-            size, tags = int(reader.take("u8", 1)[0]), 0
+            size, tags = int(reader.read_numbers("u8", 1)[0]), 0
         nodes = _nodes_of(kind, solid)
-        table = reader.tables(size, ("u8" if version == "4.1" else "i4", 1 + tags + nodes))[0].values
+        table = reader.read_tables(size, ("u8" if version == "4.1" else "i4", 1 + tags + nodes))[0].values
         groups = table[:, 1] if tags else np.full(len(table), group)
         yield kind, groups.astype(np.int64), table[:, 1 + tags :].astype(np.int64)
         count -= max(size, 1) if version == "2" else 1
@@ -241,13 +243,13 @@ def _groups_of_entities(
 ) -> dict[tuple[int, int], list[int]]:
     """Return the physical groups of the entities of version 4, by their dimensions and tags."""
     reader, groups = TableReader(data, *span, order), {}
-    for dimension, count in enumerate(reader.take("u8", 4).tolist()):
+    for dimension, count in enumerate(reader.read_numbers("u8", 4).tolist()):
         for _ in range(count):
-            tag = int(reader.take("i4", 1)[0])
-            reader.skip("f8", 3 if version == "4.1" and dimension == 0 else 6)
-            groups[dimension, tag] = reader.take("i4", int(reader.take("u8", 1)[0])).tolist()
+            tag = int(reader.read_numbers("i4", 1)[0])
+            reader.skip_numbers("f8", 3 if version == "4.1" and dimension == 0 else 6)
+            groups[dimension, tag] = reader.read_numbers("i4", int(reader.read_numbers("u8", 1)[0])).tolist()
             if dimension:
-                reader.skip("i4", int(reader.take("u8", 1)[0]))
+                reader.skip_numbers("i4", int(reader.read_numbers("u8", 1)[0]))
     return groups
 
 
@@ -263,11 +265,11 @@ def _node_data(data: bytes, begin: int, end: int, order: str | None, tags: IntAr
     """Return values at every node, NaN at nodes without value; (n, k)."""
     head = TableReader(data, begin, end, "<")
     for _ in range(2):  # Skip the names, then the real numbers.
-        for _ in range(int(head.words()[0])):
-            head.line()
-    integers = [int(head.words()[0]) for _ in range(int(head.words()[0]))]
+        for _ in range(int(head.read_words()[0])):
+            head.read_line()
+    integers = [int(head.read_words()[0]) for _ in range(int(head.read_words()[0]))]
     _, components, count = integers[:3]
-    table, values = TableReader(data, head.position, end, order).tables(count, ("i4", 1), ("f8", components))
+    table, values = TableReader(data, head.position, end, order).read_tables(count, ("i4", 1), ("f8", components))
     result = np.full((len(tags), components), np.nan)
     node = table.values[:, 0].astype(np.int64)
     at = np.searchsorted(tags, node).clip(max=len(tags) - 1)

@@ -8,15 +8,9 @@ from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
-from quasiharmonic.io.fem.mesh_parts import (
-    MeshParts,
-    Table,
-    TableReader,
-    find_counts,
-    find_sets,
-    replace_numbers,
-    select_elements,
-)
+from quasiharmonic.io.fem.mesh_parts import MeshParts
+from quasiharmonic.io.fem.number_tables import Table, TableReader, replace_numbers
+from quasiharmonic.io.fem.vtk_cells import find_counts, find_sets_in_fields, select_elements
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 _KINDS = {
@@ -56,10 +50,10 @@ class _LegacyReader:
     def __init__(self, data: bytes) -> None:
         self._data = data
         head = TableReader(data, 0, len(data), ">")
-        if not head.line().startswith(b"# vtk DataFile Version"):
+        if not head.read_line().startswith(b"# vtk DataFile Version"):
             raise ValueError("it does not start like a legacy VTK file")
-        head.line()
-        coding = head.line().upper()
+        head.read_line()
+        coding = head.read_line().upper()
         if coding not in (b"ASCII", b"BINARY"):
             raise ValueError("its third line must be ASCII or BINARY")
         self._reader = TableReader(data, head.position, len(data), None if coding == b"ASCII" else ">")
@@ -74,7 +68,7 @@ class _LegacyReader:
 
     def parts(self, solid: bool) -> MeshParts:
         """Read all sections and return the mesh."""
-        while words := self._reader.words():
+        while words := self._reader.read_words():
             self._section(words[0].upper(), words[1:])
         if self._points is None:
             raise ValueError("there is no section POINTS")
@@ -90,7 +84,7 @@ class _LegacyReader:
         points = place.values.astype(np.float64)
         change = partial(replace_numbers, self._data, place)
         precision, fields = np.dtype(place.values.dtype.newbyteorder("=")), self._fields
-        sets = partial(find_sets, fields[True], fields[False], corners, begins)
+        sets = partial(find_sets_in_fields, fields[True], fields[False], corners, begins)
         return MeshParts(points, F, precision, fields[True], change, sets)
 
     def _section(self, name: bytes, words: list[bytes]) -> None:
@@ -102,28 +96,28 @@ class _LegacyReader:
             kind = _KINDS.get(words[1].lower(), "")
             if kind not in ("f4", "f8"):
                 raise ValueError(f"its positions are {_text(words[1:])}: save them as float or double")
-            (self._points,) = reader.tables(int(words[0]), (kind, 3))
+            (self._points,) = reader.read_tables(int(words[0]), (kind, 3))
         elif name == b"CELLS" or name in _POLY:
             self._cells(int(words[0]), int(words[1]), _POLY.get(name, 0))
         elif name == b"CELL_TYPES":
-            self._kinds = reader.take("i4", int(words[0])).astype(np.int64)
+            self._kinds = reader.read_numbers("i4", int(words[0])).astype(np.int64)
         elif name in (b"POINT_DATA", b"CELL_DATA"):
             self._of_points, self._count = name == b"POINT_DATA", int(words[0])
         elif name == b"METADATA":
-            while reader.line():
+            while reader.read_line():
                 pass
         elif name == b"FIELD":
             for _ in range(int(words[1])):
                 self._field()
         elif name == b"SCALARS":
             begin = reader.position
-            if reader.words()[:1] != [b"LOOKUP_TABLE"]:
+            if reader.read_words()[:1] != [b"LOOKUP_TABLE"]:
                 reader.position = begin
             self._array(words[0], words[1], int(words[2]) if len(words) > 2 else 1)
         elif name == b"LOOKUP_TABLE":
-            reader.skip("u1", 4 * int(words[1]))
+            reader.skip_numbers("u1", 4 * int(words[1]))
         elif name == b"COLOR_SCALARS":
-            reader.skip("u1", self._count * int(words[1]))
+            reader.skip_numbers("u1", self._count * int(words[1]))
         elif name == b"TEXTURE_COORDINATES":
             self._array(words[0], words[2], int(words[1]))
         elif name in _COMPONENTS:
@@ -135,14 +129,14 @@ class _LegacyReader:
         """Read a list of cells, in the format of version 5.1 or of earlier versions."""
         reader = self._reader
         begin = reader.position
-        words = reader.words()
+        words = reader.read_words()
         if words[:1] == [b"OFFSETS"]:
-            offsets = reader.take(_KINDS[words[1].lower()], count).astype(np.int64)
-            connectivity = reader.take(_KINDS[reader.words()[1].lower()], size).astype(np.int64)
+            offsets = reader.read_numbers(_KINDS[words[1].lower()], count).astype(np.int64)
+            connectivity = reader.read_numbers(_KINDS[reader.read_words()[1].lower()], size).astype(np.int64)
             self._lists.append((offsets if count else np.zeros(1, dtype=np.int64), connectivity, kind))
             return
         reader.position = begin
-        mixed = reader.take("i4", size).astype(np.int64)
+        mixed = reader.read_numbers("i4", size).astype(np.int64)
         counts = find_counts(mixed)
         if counts is None or len(counts) != count:
             raise ValueError("its lists of cells contradict each other")
@@ -151,10 +145,10 @@ class _LegacyReader:
 
     def _field(self) -> None:
         """Read an array of a field: name, components, tuples, kind."""
-        words = self._reader.words()
+        words = self._reader.read_words()
         while words[:1] == [b"METADATA"]:
             self._section(b"METADATA", [])
-            words = self._reader.words()
+            words = self._reader.read_words()
         if len(words) == 4:
             count, self._count = self._count, int(words[2])
             of_points, self._of_points = self._of_points, self._of_points if self._count == count else None
@@ -176,29 +170,29 @@ class _LegacyReader:
     def _values(self, start: int, kind: bytes, components: int, count: int) -> FloatArray:
         order = None if self._reader.text else ">"
         reader = TableReader(self._data, start, len(self._data), order)
-        return reader.tables(count, (_KINDS[kind], components))[0].values.astype(np.float64)
+        return reader.read_tables(count, (_KINDS[kind], components))[0].values.astype(np.float64)
 
     def _skip(self, kind: bytes, count: int) -> None:
         """Skip numbers or strings."""
         reader, kind = self._reader, kind.lower()
         if kind == b"string":
             for _ in range(count):
-                reader.line() if reader.text else self._skip_string()
+                reader.read_line() if reader.text else self._skip_string()
         elif kind == b"bit":
-            reader.take("u1", count if reader.text else (count + 7) // 8)
+            reader.read_numbers("u1", count if reader.text else (count + 7) // 8)
         elif kind not in _KINDS:
             raise ValueError(f"arrays of {_text([kind])} are not supported")
         else:
-            reader.skip(_KINDS[kind], count)
+            reader.skip_numbers(_KINDS[kind], count)
 
     def _skip_string(self) -> None:
         """Skip a string; the first two bits encode the number of bytes of its length."""
-        first = int(self._reader.take("u1", 1)[0])
+        first = int(self._reader.read_numbers("u1", 1)[0])
         more = {3: 0, 2: 1, 1: 3, 0: 7}[first >> 6]
         length = first & 63
-        for byte in self._reader.take("u1", more).tolist():
+        for byte in self._reader.read_numbers("u1", more).tolist():
             length = 256 * length + byte
-        self._reader.take("u1", length)
+        self._reader.read_numbers("u1", length)
 
 
 def _text(words: list[bytes]) -> str:

@@ -7,7 +7,9 @@ from functools import partial
 
 import numpy as np
 
-from quasiharmonic.io.fem.mesh_parts import MeshParts, TableReader, replace_numbers, select_elements
+from quasiharmonic.io.fem.mesh_parts import MeshParts
+from quasiharmonic.io.fem.number_tables import TableReader, replace_numbers
+from quasiharmonic.io.fem.vtk_cells import select_elements
 from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -46,10 +48,10 @@ def read_mfem(data: bytes, solid: bool = False) -> MeshParts:
         return begin, later[0] if later else len(plain)
 
     vertices = TableReader(plain, *span(b"vertices"), None)
-    count, axes = vertices.take("i8", 2).tolist()
+    count, axes = vertices.read_numbers("i8", 2).tolist()
     if axes not in (2, 3):
         raise ValueError(f"its vertices have {axes} coordinates, not two or three")
-    table = vertices.tables(count, ("f8", axes))[0]
+    table = vertices.read_tables(count, ("f8", axes))[0]
     points = np.zeros((count, 3))
     points[:, :axes] = table.values
     begin, end = span(b"elements")

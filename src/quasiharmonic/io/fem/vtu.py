@@ -27,7 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.atomic import write_whole
-from quasiharmonic.io.fem.mesh_parts import MeshParts, TableReader, find_sets, replace_numbers, select_elements
+from quasiharmonic.io.fem.mesh_parts import MeshParts
+from quasiharmonic.io.fem.number_tables import TableReader, replace_numbers
+from quasiharmonic.io.fem.vtk_cells import find_sets_in_fields, select_elements
 from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -93,7 +95,7 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
         np.dtype(_KINDS[precision]),
         fields,
         partial(file.replace_points, points),
-        partial(find_sets, fields, of_cells, connectivity, starts),
+        partial(find_sets_in_fields, fields, of_cells, connectivity, starts),
     )
 
 
@@ -168,7 +170,7 @@ class _VtuFile:
         """Return the file with the first of every three numbers of an array replaced, by (n, 2) or (n, 3)."""
         if array.attributes.get("format") == "ascii":
             reader = TableReader(self._data, array.begin, array.end, None)
-            table = reader.tables(len(points), (_KINDS[array.attributes["type"]], 3))[0]
+            table = reader.read_tables(len(points), (_KINDS[array.attributes["type"]], 3))[0]
             return replace_numbers(self._data, table, points)
         number = np.dtype(self._order + _KINDS[array.attributes["type"]])
         block, begin, end = self._block(array, 3 * self.points * number.itemsize)

@@ -127,7 +127,7 @@ def check_mapped(mesh: MeshData) -> None:
         raise MeshFileError(
             mesh.source,
             f"{names_of('face', 'faces', bare)} (0-based) without texture coordinates, which other faces have",
-            remedy="map the whole mesh, or remove these faces",
+            remedy="map the whole mesh (qhm unwrap, or qhm flatten --seams none), or remove these faces",
         )
 
 

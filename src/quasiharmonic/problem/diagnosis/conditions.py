@@ -1,7 +1,7 @@
 """Conditions on single elements: vertices, edges, triangles and patches.
 
-The first ones hold for every map without inverted triangles. They do not depend on whether the target overlaps itself:
-the triangles of an element must be positive for any positions of the other vertices.
+The first ones hold for every map without inverted triangles, also onto a target that overlaps itself: the triangles of
+an element must be positive for any positions of the other vertices.
 
 Further ones, `bad_chords` and `Sight`, are for targets whose loops are simple, disjoint and properly nested. A map
 without inverted triangles is then injective onto the region between the loops, and maps interior points to interior

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.predicates import SegmentRelation, box_pairs_between, orientation, segment_relation
+from quasiharmonic.geometry.exact.box_pairs import box_pairs_between
+from quasiharmonic.geometry.exact.predicates import SegmentRelation, orientation, segment_relation
 from quasiharmonic.problem.diagnosis.fixture import Corners, Fixture, Stars
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, morton_order
 from quasiharmonic.util.progress import heartbeat

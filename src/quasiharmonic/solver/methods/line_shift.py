@@ -42,7 +42,7 @@ class LineShiftTuning(NamedTuple):
     max_triangles: int = 2000
     # Maximum number for a patch with the fewest rings, which is large around a vertex with very many neighbours.
     max_triangles_near: int = 20000
-    # Least value δ of a positive triangle, as a fraction of its height over its widest side.
+    # Least value δ of a positive triangle, as a fraction of its present value.
     min_share: float = 0.1
     # Maximum of this value δ, in widths.
     max_widths: float = 1.0

@@ -12,6 +12,14 @@ K is eliminated on each triangle, which leaves ``H − B K⁻¹ Bᵀ`` with the 
 the step the map is made quasi-harmonic again, which only lowers the energy. The method is therefore also Newton's
 method for V₃ as a function of ξ alone.
 
+With ``r = |μ|`` as a function of |ξ|, and its first two derivatives ``r'`` and ``r''``::
+
+    c = (1 + r²) / (1 − r²)      c' = 4 r / (1 − r²)² r'           c'' = 4 (1 + 3 r²) / (1 − r²)³ r'² + c'/r' r''
+    s = 2 r / (1 − r²)           s' = 2 (1 + r²) / (1 − r²)² r'    s'' = 4 r (3 + r²) / (1 − r²)³ r'² + s'/r' r''
+
+Across ξ, quotients ``c'/|ξ|`` and ``(s' − s/|ξ|) / |ξ|`` occur. At ``ξ = 0``, where
+``r' = 1``, they have the limits 4 and ``s''/2``.
+
 The trust region has Levenberg's form: ``K + λ m (|p|² + |q|²) I``. As λ grows, the step shrinks towards the gradient's
 direction, and ``H − B K⁻¹ Bᵀ`` tends to the positive definite H.
 """
@@ -34,11 +42,19 @@ from quasiharmonic.util.arrays import ComplexArray, sum_at
 class NewtonTuning(NamedTuple):
     """Numbers that tune the damping of Newton's method."""
 
-    # First and largest damping.
+    # First and largest damping λ.
     first_damping: float = 1e-2
     max_damping: float = 1e12
-    # Least eigenvalue of a triangle's block K, as a fraction of the largest of all. The block of a triangle that has
-    # shrunk to a point is zero and not invertible.
+    # The damping grows by the factor if a step gains less than the first part of what the model predicts, and falls by
+    # it if a step gains more than the second part.
+    factor: float = 4.0
+    poor_gain: float = 0.25
+    good_gain: float = 0.75
+    # A step is taken if it gains more than this part.
+    least_gain: float = 1e-4
+    # Least eigenvalue of a triangle's block K, as a fraction of the largest of the block, and of the largest of all.
+    # The block of a triangle that has shrunk to a point is zero and not invertible.
+    min_ratio: float = 1e-10
     min_eigenvalue: float = 1e-100
 
 
@@ -74,11 +90,11 @@ class Newton(TensorDescent):
             except NotPositiveDefinite:
                 predicted, there = 0.0, None
             gain = (here.dirichlet - there.dirichlet) / predicted if there is not None and predicted > 0 else -np.inf
-            if gain < 0.25:
-                damping *= 4
-            elif gain > 0.75:
-                damping /= 4
-            if there is not None and gain > 1e-4:
+            if gain < _TUNING.poor_gain:
+                damping *= _TUNING.factor
+            elif gain > _TUNING.good_gain:
+                damping /= _TUNING.factor
+            if there is not None and gain > _TUNING.least_gain:
                 here = there
                 yield here
                 model = SecondOrderModel(here)
@@ -143,7 +159,7 @@ class SecondOrderModel:
         # An inverted triangle may have a concave block: take absolute eigenvalues and bound them away from zero.
         mean, half = 0.5 * (k11 + k22), np.hypot(0.5 * (k11 - k22), k12)
         high, low = np.abs(mean + half), np.abs(mean - half)
-        floor = 1e-10 * np.maximum(high, low) + _TUNING.min_eigenvalue * high.max()
+        floor = _TUNING.min_ratio * np.maximum(high, low) + _TUNING.min_eigenvalue * high.max()
         high, low = np.maximum(high, floor), np.maximum(low, floor)
         # Keep the eigenvectors: scale the deviator to the new half difference, which may have either sign.
         swapped = np.abs(mean - half) > np.abs(mean + half)

@@ -51,7 +51,7 @@ _PATTERNS = 8
 SMALL = 4_000
 # Maximum number of triangles of a batch. Twice as many are not faster per triangle, because the arrays exceed the
 # cache. At this size QDLDL is still the default solver if MKL is not installed.
-GROUP = 28_000
+MAX_BATCH = 28_000
 # Iterations before batches are joined. After two, nine in ten easy problems are solved; the rest of one batch would be
 # too small.
 _ITERATIONS_APART = 2
@@ -365,10 +365,10 @@ def _next_power_of_two(count: int) -> int:
 
 
 def _divide(sizes: Sequence[int]) -> list[tuple[int, int]]:
-    """Return start and end indices of consecutive portions of at most ``GROUP`` triangles."""
+    """Return start and end indices of consecutive portions of at most ``MAX_BATCH`` triangles."""
     portions, first, total = list[tuple[int, int]](), 0, 0
     for k, size in enumerate(sizes):
-        if k > first and total + size > GROUP:
+        if k > first and total + size > MAX_BATCH:
             portions.append((first, k))
             first, total = k, 0
         total += size

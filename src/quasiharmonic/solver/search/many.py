@@ -1,4 +1,9 @@
-"""Solve many problems in one call: small problems in groups, and groups on all available cores."""
+"""Solve many problems in one call on all available cores.
+
+A *group* has consecutive problems, which one thread solves. The first stage of its small problems runs in *batches*:
+the meshes of a batch are combined into one mesh (`quasiharmonic.solver.search.first_stage`). A group has at most as
+many triangles as four full batches, or it is one larger problem.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +26,7 @@ from quasiharmonic.io.objects import mesh_arrays, stands_for_mesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.problem import set_up_batch
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.solver.search.first_stage import GROUP, SMALL, Patterns, group_by_first_stage, run_first_stage
+from quasiharmonic.solver.search.first_stage import MAX_BATCH, SMALL, Patterns, group_by_first_stage, run_first_stage
 from quasiharmonic.solver.search.search import Search, finish_search, search_map
 from quasiharmonic.solver.search.stages import STRATEGIES, Stages
 from quasiharmonic.util.arrays import check_callback, check_choice, check_integer, check_sequence
@@ -32,19 +37,20 @@ from quasiharmonic.util.threads import count_cores, make_executor
 Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 
 
-class BatchTuning(NamedTuple):
-    """Numbers that tune batches of problems."""
+class GroupTuning(NamedTuple):
+    """Numbers that tune groups of problems."""
 
-    # Maximum size of a batch in groups. The unsolved problems of a batch are joined after the first iterations.
-    groups: int = 4
-    # A batch has at most this part (1 / `divisor`) of the triangles before it, so that no thread has much left while
-    # the others are idle. It may always have one group.
+    # Maximum size of a group in full batches. The unsolved problems of these batches are joined after the first
+    # iterations.
+    batches: int = 4
+    # A group has at most this part (1 / `divisor`) of the triangles of all groups before it, so that no thread has much
+    # left while the others are idle. It may always have one full batch.
     divisor: int = 8
     # Seconds between two calls of the callback while no problem finishes, and between two checks for an interrupt.
     tick: float = 0.2
 
 
-_TUNING = BatchTuning()
+_TUNING = GroupTuning()
 
 
 class ManyKeywords(TypedDict, total=False):
@@ -91,7 +97,7 @@ def injective_maps(
     ------
     MapResult
         In the order of the problems. A problem without a map is not an error; see `injective_map`. For problems solved
-        in a group, ``seconds`` is a share of the group's time.
+        in a batch, ``seconds`` is a share of the batch's time.
 
     Raises
     ------
@@ -108,8 +114,8 @@ def injective_maps(
 
     Notes
     -----
-    Meshes of up to 4,000 triangles are combined into groups of about 28,000 triangles for the first stage of the
-    search. After two iterations the unsolved problems of up to four groups are joined. Grouping does not change the
+    Meshes of up to 4,000 triangles are combined into batches of about 28,000 triangles for the first stage of the
+    search. After two iterations the unsolved problems of up to four batches are joined. Batching does not change the
     path of a problem: the same call gives the same maps for any ``jobs``. They equal the maps of `injective_map` except
     for rounding, which may lead a long search to another map. Ctrl-C and closing the iterator end all work within a
     fraction of a second.
@@ -197,7 +203,7 @@ def _group_problems(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
     first, group, size, before = 0, list[Any](), 0, 0
     for given in problems:
         triangles = _count_triangles(given)
-        limit = GROUP * min(max(before // (_TUNING.divisor * GROUP), 1), _TUNING.groups)
+        limit = MAX_BATCH * min(max(before // (_TUNING.divisor * MAX_BATCH), 1), _TUNING.batches)
         if group and (size + triangles > limit or triangles > SMALL):
             yield first, group
             before += size
@@ -228,7 +234,7 @@ class _Worker:
 
     def solve(self, first: int, group: Sequence[Any]) -> list[MapResult | Exception]:
         """Return the result or the exception of each problem; ``first`` is the number of the first problem."""
-        ready = self._set_up_batch(group)
+        ready = self._set_up_small(group)
         posed = [self._set_up(first + k, given, ready.get(k)) for k, given in enumerate(group)]
         begun: dict[int, MapResult | Search] = {}
         problems = {k: one for k, one in enumerate(posed) if not isinstance(one, Exception)}
@@ -240,8 +246,8 @@ class _Worker:
             for k, problem in enumerate(posed)
         ]
 
-    def _set_up_batch(self, group: Sequence[Any]) -> dict[int, Problem]:
-        """Set up problems with small meshes given as arrays in one batch; return {} if one of them is invalid."""
+    def _set_up_small(self, group: Sequence[Any]) -> dict[int, Problem]:
+        """Set up the problems with small meshes given as arrays together; return {} if one of them is invalid."""
         if self._reference is not None:
             return {}
         new = dict[int, Any]()

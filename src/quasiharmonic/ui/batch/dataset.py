@@ -22,7 +22,7 @@ from quasiharmonic.ui.batch.readers import ArchiveReader, FolderReader, Scratch
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.shards import Shard
 from quasiharmonic.ui.batch.supervisor import Finished, find_resumed
-from quasiharmonic.ui.batch.writers import ArchiveWriter, FolderWriter
+from quasiharmonic.ui.batch.writers import ResultWriter
 
 _PREFIX = "qhm-batch-"
 
@@ -32,7 +32,7 @@ class Stream:
     """Reader and writer of the same problems: of an archive, or of all problems in folders."""
 
     reader: FolderReader | ArchiveReader
-    writer: FolderWriter | ArchiveWriter
+    writer: ResultWriter
     waiting: int = 0  # Number of problems that are read but not finished
     read: bool = False  # Whether all problems are read
 

@@ -26,7 +26,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.problem import Given, set_up_batch
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.search.first_stage import SMALL, Patterns, group_by_first_stage, run_first_stage
-from quasiharmonic.ui.batch import island_problems, metadata, records
+from quasiharmonic.ui.batch import island_problems, memory, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -66,7 +66,7 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
     called with ``{"done": k, "outcome": …, "seconds": …}`` when the record of problem ``k`` is written. OutputError if
     a map or a record cannot be written.
     """
-    metadata.forget_peak()
+    memory.reset_peak()
     settings, folders = jobs[0]["settings"], [Path(job["folder"]) for job in jobs]
     read: dict[int, _ReadProblem] = {}
     for k, job in enumerate(jobs):
@@ -79,7 +79,7 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
     for k, result in _solve_first_stage({k: one.problem for k, one in posed.items()}, settings):
         record, certificate = read[k].record, result.certificate
         path = records.map_path(folders[k], settings["map_format"])
-        record |= metadata.sizes([posed[k].problem]) | metadata.describe_search([result], result.status)
+        record |= metadata.describe_sizes([posed[k].problem]) | metadata.describe_search([result], result.status)
         record |= {"flips_before": result.history[0].inverted, "seconds_map": result.seconds}
         try:
             records.clear(folders[k])
@@ -91,8 +91,8 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
                 continue
             record |= metadata.describe_map(path, "injective", True, bool(certificate.bijective), 0)
             with metadata.time_phase(record, "measure"):
-                record |= metadata.measure(V, F, uv)
-            record["peak_memory"] = metadata.peak()
+                record |= metadata.describe_distortion(V, F, uv)
+            record["peak_memory"] = memory.measure_peak()
             record["seconds"] = sum(value for name, value in record.items() if name.startswith("seconds_"))
             records.write_record(folders[k], record)
         except FileInUseError:
@@ -102,7 +102,7 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
 
 def read_problem(job: Job) -> _ReadProblem:
     """Read a problem; raise the errors of the readers."""
-    record: Record = {**job["record"], "versions": metadata.versions()}
+    record: Record = {**job["record"], "versions": metadata.list_versions()}
     with metadata.time_phase(record, "read"):
         mesh = io.read_mesh(job["mesh"])
         fixed = None if job["fixed"] is None else io.read_handles(job["fixed"], len(mesh.V))

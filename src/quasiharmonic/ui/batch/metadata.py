@@ -1,13 +1,15 @@
-"""Metadata of a record: sizes, stages, distortion, times, memory and versions."""
+"""Values of a record that describe one solved problem: sizes, stages, the map, its distortion, times and versions.
+
+The functions ``describe_…`` return fields of a record, and `time_phase` adds one. `records.COLUMNS` lists all fields.
+"""
 
 from __future__ import annotations
 
 import json
 import platform
-import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import version
 from math import isfinite
@@ -21,7 +23,7 @@ from quasiharmonic.ui.batch.records import Record, describe_contents
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
-def sizes(problems: list[Problem]) -> Record:
+def describe_sizes(problems: list[Problem]) -> Record:
     """Return the total sizes of the problems of a mesh's islands."""
     return {
         "vertices": sum(problem.n for problem in problems),
@@ -58,7 +60,7 @@ def describe_map(path: Path, required: str, certified: bool, bijective: bool, in
     }
 
 
-def measure(V: FloatArray, F: IntArray, uv: FloatArray) -> Record:
+def describe_distortion(V: FloatArray, F: IntArray, uv: FloatArray) -> Record:
     """Return the distortion of a map; empty if no triangle has an area in the rest mesh."""
     found = distortion(V, F, uv)
     if len(found.flat) == len(F):
@@ -79,33 +81,7 @@ def time_phase(record: Record, phase: str) -> Iterator[None]:
 
 
 @cache
-def versions() -> str:
+def list_versions() -> str:
     """Return the versions of Python and packages as JSON."""
     packages = {name: version(name) for name in ("numpy", "scipy")}
     return json.dumps({"quasiharmonic": __version__, "python": platform.python_version(), **packages})
-
-
-def forget_peak() -> None:
-    """Reset the peak memory of this process, where the system supports it (Linux)."""
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
-
-
-def peak() -> int | None:
-    """Return the peak resident memory in bytes: since `forget_peak` on Linux, of the process elsewhere; else None."""
-    with suppress(OSError, IndexError):
-        return 1024 * int(Path("/proc/self/status").read_text(encoding="utf-8").split("VmHWM:")[1].split()[0])
-    try:
-        import resource
-    except ImportError:
-        return _peak_on_windows()
-    max_rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return max_rss if sys.platform == "darwin" else 1024 * max_rss
-
-
-def _peak_on_windows() -> int | None:
-    try:
-        import psutil
-    except ImportError:
-        return None
-    return getattr(psutil.Process().memory_info(), "peak_wset", None)

@@ -37,8 +37,8 @@ from quasiharmonic.io.untrusted import use_bound
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refinement import on_refinement
-from quasiharmonic.targets.boundary.boundary_to import FittedProblem
-from quasiharmonic.ui.batch import groups, island_problems, metadata, records
+from quasiharmonic.targets.boundary.fitted_problems import FittedProblem
+from quasiharmonic.ui.batch import groups, island_problems, memory, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.util.options import PolishOptions
@@ -116,9 +116,9 @@ def solve_files(job: dict[str, Any], tell: Tell) -> Record:
     """
     folder = Path(job["folder"])
     records.clear(folder)
-    metadata.forget_peak()
+    memory.reset_peak()
     began = time.perf_counter()
-    record: Record = {**job["record"], "versions": metadata.versions()}
+    record: Record = {**job["record"], "versions": metadata.list_versions()}
     try:
         fill_record(job, folder, record, tell)
     except FileInUseError as error:
@@ -131,7 +131,7 @@ def solve_files(job: dict[str, Any], tell: Tell) -> Record:
         # Errors of the input are raised before the sizes are recorded.
         wrong_input = isinstance(error, ValueError) and "vertices" not in record
         record |= {"outcome": "invalid", "error": str(error)} if wrong_input else _describe_error(error)
-    record["peak_memory"] = metadata.peak()
+    record["peak_memory"] = memory.measure_peak()
     record["seconds"] = time.perf_counter() - began
     records.write_record(folder, record)
     return record
@@ -168,7 +168,7 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -
     with metadata.time_phase(record, "write"):
         record |= _write_map(path, mapped, "bijective" if settings["flatten"] else "injective")
     with metadata.time_phase(record, "measure"):
-        record |= metadata.measure(*io.without_idle(*io.cut_at_seams(mapped)))
+        record |= metadata.describe_distortion(*io.without_idle(*io.cut_at_seams(mapped)))
 
 
 def _unwrap_model(mesh: io.MeshData, options: dict[str, Any], path: Path, record: Record, tell: Tell) -> None:
@@ -205,7 +205,7 @@ def _map_islands(
     with metadata.time_phase(record, "setup"):
         posed = island_problems.make_problems(surface, fixed, settings)
     problems = [one.fitted.problem for one in posed]
-    record |= metadata.sizes(problems)
+    record |= metadata.describe_sizes(problems)
     tell({"facts": record})
     todo = iter(posed)
     # The problems are in the order in which islands are solved.

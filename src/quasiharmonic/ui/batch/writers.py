@@ -1,6 +1,7 @@
-"""Writers of a data set: they keep the results of its problems, in folders or in archives.
+"""Writers of a data set keep the results of its problems: in folders (`FolderWriter`) or archives (`ArchiveWriter`).
 
-Results of an archive that is not finished are in a journal, in the order in which they were found.
+Both are a `ResultWriter`, which states the order of the calls. Results of an archive that is not finished are in a
+`Journal`, in the order in which they were found.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, Protocol
 
 from quasiharmonic.io.atomic import writing
 from quasiharmonic.ui.batch import places, records
@@ -35,19 +36,22 @@ from quasiharmonic.ui.batch.supervisor import is_valid
 _KEPT = "key", "outcome", "time_limit", "memory_limit", "seconds"
 
 
-class FolderWriter:
-    """Results in the folders of the problems, where workers write them.
+class ResultWriter(Protocol):
+    """Writer of the results of the problems that one reader reads.
 
-    Parameters
-    ----------
-    reader : FolderReader
-        The problems.
-    orders : Orders
-        Parameters of the run.
+    The methods are called in this order:
+
+    1. `find_finished`. If it returns outcomes, only `records` follows.
+    2. `open`.
+    3. `resume` once for each problem, in the order of the reader. Later `add` for each problem with a new result, in
+       the order in which these problems are finished; the calls of `resume` for other problems may come between.
+    4. `fail`, at most once, if the reader, `find_finished` or `open` raises an OSError other than `OutputError`. Then
+       `resume` is not called again.
+    5. `finish`, after the last `add`, but only if `open` has succeeded.
+    6. `records`, at the end of the run.
+
+    An interrupted run ends without `finish` and `records`.
     """
-
-    def __init__(self, reader: FolderReader, orders: Orders) -> None:
-        self._reader, self._orders = reader, orders
 
     def find_finished(self) -> Counter[str] | None:
         """Return the numbers of outcomes if all problems are known to be finished, before they are read; else None."""
@@ -63,13 +67,47 @@ class FolderWriter:
 
     def fail(self, error: OSError) -> None:
         """Note that the problems cannot be read; raise the error if the run cannot continue."""
-        raise error
 
     def finish(self) -> None:
         """Complete the results after the last problem."""
 
     def records(self) -> Iterator[Record]:
         """Yield the records of the finished problems, in order."""
+
+
+class FolderWriter:
+    """Results in the folders of the problems, where workers write them, so that most methods do nothing.
+
+    Parameters
+    ----------
+    reader : FolderReader
+        The problems.
+    orders : Orders
+        Parameters of the run.
+    """
+
+    def __init__(self, reader: FolderReader, orders: Orders) -> None:
+        self._reader, self._orders = reader, orders
+
+    def find_finished(self) -> Counter[str] | None:
+        return None
+
+    def open(self) -> None:
+        pass
+
+    def resume(self, files: ProblemFiles) -> Record | None:
+        return None
+
+    def add(self, files: ProblemFiles, record: Record | None) -> None:
+        pass
+
+    def fail(self, error: OSError) -> None:
+        raise error
+
+    def finish(self) -> None:
+        pass
+
+    def records(self) -> Iterator[Record]:
         for files in self._reader.problems(self._orders):
             record = records.read_record(self._orders.folder(files))
             if record is not None:
@@ -77,7 +115,7 @@ class FolderWriter:
 
 
 class ArchiveWriter:
-    """Results in an archive: the methods are as for `FolderWriter`.
+    """Results in an archive, which is written from a journal when all problems are finished.
 
     Parameters
     ----------
@@ -103,9 +141,11 @@ class ArchiveWriter:
         # Where the finished archive is.
         self._location = str(self._path) if url is None else places.join(url, f"results/{self._name}")
         self._key, self._form = key, orders.settings.map_format
-        self._order: list[str] = []  # Names of the problems so far
+        self._stamp = ""  # Stamp of the archive of problems, from `find_finished` on
+        self._journal: Journal | None = None  # From `open` until `finish`
+        self._order: list[str] = []  # Names of the problems so far; empty after `finish`
         self._lost = False  # Whether a problem has no record
-        self._failure: str | None = None
+        self._failure: str | None = None  # Message of the error of `fail`
 
     def find_finished(self) -> Counter[str] | None:
         self._stamp = places.stamp(self._archive.location)
@@ -130,6 +170,7 @@ class ArchiveWriter:
         self._journal = Journal(self._path)
 
     def resume(self, files: ProblemFiles) -> Record | None:
+        assert self._journal is not None, "open was not called"
         self._order.append(self._key_of(files))
         return self._journal.record(self._order[-1])
 
@@ -137,6 +178,7 @@ class ArchiveWriter:
         if record is None:
             self._lost = True
             return
+        assert self._journal is not None, "open was not called"
         if record.get("error"):
             record["error"] = record["error"].replace(str(files.results), record["source"])
         path = self._orders.map_path(self._orders.folder(files))
@@ -149,8 +191,9 @@ class ArchiveWriter:
 
     def finish(self) -> None:
         journal, order = self._journal, self._order
-        # Memory must not grow with the number of problems.
-        del self._journal, self._order
+        assert journal is not None, "open was not called"
+        # The names and entries of a finished archive are not kept: memory must not grow with the number of problems.
+        self._journal, self._order = None, []
         if self._lost:
             return
         journal.finish(order, self._stamp, self._key, self._form)

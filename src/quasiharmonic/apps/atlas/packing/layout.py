@@ -29,20 +29,25 @@ class LayoutTuning(NamedTuple):
     expected: float = 0.8
     # Directions compared for the expected scale.
     turns: int = 16
-    # Cells around charts that stay are first as large as otherwise, then smaller by this factor.
+    # Around charts that stay, shapes are placed on boards with this many times as many cells along a tile, in turn:
+    # first quickly, then into narrow places.
     finer: tuple[int, ...] = (1, 4)
+    # Around charts that stay, the scale is halved at most so often until the shapes fit, and bisected so often then.
+    halvings: int = 24
+    bisections: int = 5
+    # Number of angles compared for the direction of a single shape, and the precision of the best one.
+    angles: int = 256
+    angle_precision: float = 1e-6
+    # Number of cells along each texel if shapes are placed as boxes.
+    box_cells: int = 4
     # Relative precision of the sufficient size.
     size_precision: float = 0.01
 
 
 _TUNING = LayoutTuning()
 
-# Angles compared for the direction of a single chart, and the precision of the best one.
-_ANGLES, _ANGLE_PRECISION = 256, 1e-6
 #: Largest side of a texture in texels: single precision stores no more positions.
 MAX_SIZE = 1 << 24
-# Largest number of times that the scale there is halved, and then bisected.
-_HALVINGS, _BISECTIONS = 24, 5
 
 
 def find_layout(
@@ -159,13 +164,13 @@ def find_layout_around(
     high = max(size) * max(1.0, sqrt(tiles)) / min(sum(shape.area for shape in shapes) ** 0.5, 1 / least_scale(shapes))
     best, low = None, high
     longest = max(max(shape.extent(shape.direction)) for shape in shapes)
-    for _ in range(_HALVINGS):
+    for _ in range(_TUNING.halvings):
         high, low = low, low / 2
         best = place(low)
         # Smaller charts need hardly less room if the padding is larger than they are.
         if best is not None or low * longest < min(1.0, padding):
             break
-    for _ in range(_BISECTIONS if best is not None else 0):
+    for _ in range(_TUNING.bisections if best is not None else 0):
         middle = sqrt(low * high)
         found = place(middle)
         low, high, best = (low, middle, best) if found is None else (middle, high, found)
@@ -200,13 +205,14 @@ def _place_one(shape: Shape, size: tuple[int, int], padding: float) -> Layout | 
 
     if room.min() <= 0:
         return None
-    width = pi / _ANGLES
+    width = pi / _TUNING.angles
     angles = np.angle(shape.direction) + pi / 2 * np.arange(2)
     if not shape.straight:
-        angles = np.concatenate([angles, width * np.arange(_ANGLES)])
+        angles = np.concatenate([angles, width * np.arange(_TUNING.angles)])
     best = float(angles[np.argmax(scales(angles))])
-    while not shape.straight and width > _ANGLE_PRECISION:
-        near = best + width * np.linspace(-1, 1, 9)[[4, 0, 1, 2, 3, 5, 6, 7, 8]]
+    while not shape.straight and width > _TUNING.angle_precision:
+        # The best angle so far comes first, so that it stays if no other one is better.
+        near = best + width * np.array([0, -1, -0.75, -0.5, -0.25, 0.25, 0.5, 0.75, 1])
         best, width = float(near[np.argmax(scales(near))]), width / 4
     scale, least = float(scales(np.array([best]))[0]), least_scale([shape])
     if scale < least:
@@ -248,7 +254,7 @@ def _place_boxes(
 ) -> Layout | None:
     """Place shapes as boxes at the least scale."""
     search = BitmapSearch(shapes, size, padding, tiles, least_scale(shapes), rotate=rotate, bitmaps=0)
-    return search.place_in(min(4 * max(size), MOST_CELLS))
+    return search.place_in(min(_TUNING.box_cells * max(size), MOST_CELLS))
 
 
 def least_scale(shapes: Sequence[Shape]) -> float:

@@ -17,7 +17,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline, report
+from quasiharmonic.ui.cli import pipeline, report, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_options,
     choice,
@@ -238,7 +238,7 @@ def _write_frames(folder: Path, mesh: MeshData, animation: Animation) -> tuple[b
             with report.after_writing(folder / min(written)) if written else nullcontext():
                 io.write_mapped(path, mesh.with_map(frame.uv))
                 written.add(path.name)
-                certified &= pipeline.certify_map(io.read_mesh(path)).injective
+                certified &= written_map.certify_map(io.read_mesh(path)).injective
     others = {path.name for path in folder.glob("*.obj") if path.stem.isdecimal()} - written
     return certified, sorted(others)
 

@@ -19,7 +19,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from quasiharmonic.ui.cli import finite_elements, pipeline, report
+from quasiharmonic.ui.cli import finite_elements, pipeline, report, written_map
 from quasiharmonic.ui.cli.arguments import add_options, choice, file, flag, weld
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from quasiharmonic.problem.diagnosis import Diagnosis
     from quasiharmonic.problem.inspection import MeshReport
     from quasiharmonic.targets import BoundaryLoop
-    from quasiharmonic.ui.cli.pipeline import WrittenMap
+    from quasiharmonic.ui.cli.written_map import WrittenMap
 
 
 class CornerLimits(NamedTuple):
@@ -130,7 +130,7 @@ def _verify(
 ) -> tuple[bool, dict[str, Any], list[str]]:
     """Certify the map of a mesh; return whether it passes, the entries of the report, and its text."""
     precision = options.precision or "float64"
-    certified = pipeline.certify_map(mesh, precision=precision, weld=options.weld)
+    certified = written_map.certify_map(mesh, precision=precision, weld=options.weld)
     further = len(certified.V) - len(mesh.V)
     good = certified.injective
     facts = {**certified.to_dict(), "precision": precision, "triangles": len(mesh.F), "further_places": further}

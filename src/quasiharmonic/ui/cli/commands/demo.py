@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.problem import Problem
     from quasiharmonic.solver.mapping import solve
-    from quasiharmonic.ui.cli import pipeline, process, report
+    from quasiharmonic.ui.cli import process, report, written_map
     from quasiharmonic.ui.cli.commands import map
 
     folder: Path = options.output
@@ -49,9 +49,9 @@ def run(options: argparse.Namespace) -> int:
             mapped = each_island(SeamedMesh(V, F), lambda _: solve(problem, callback=show))
         io.write_mapped(output, io.MeshData(V, F).with_places(mapped.mesh))
     with report.after_writing(output):
-        written = pipeline.certify_map(io.read_mesh(output))
+        written = written_map.certify_map(io.read_mesh(output))
         map.draw(folder / "demo.png", written, [problem], mapped)
         facts = {**mapped.to_dict(), **written.to_dict(), **report.sizes(problem.domain)}
-        report.emit(facts, str(folder / "demo.json"), pipeline.describe_maps(mapped, written, output))
+        report.emit(facts, str(folder / "demo.json"), written_map.describe_maps(mapped, written, output))
         print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)
     return 0 if written.injective else 1

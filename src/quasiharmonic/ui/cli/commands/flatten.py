@@ -20,7 +20,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import map_options, pipeline, process, report
+from quasiharmonic.ui.cli import map_options, pipeline, process, report, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_files,
     add_options,
@@ -117,7 +117,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
         mapped = atlas.flatten(found.mesh, gap=2.1 * options.allowance, callback=show, **given)
 
     def describe(written: MeshData) -> pipeline.Account:
-        certified = pipeline.certify_map(written, weld=options.weld)
+        certified = written_map.certify_map(written, weld=options.weld)
         # Some formats hold the map alone; their vertices have the numbers of the surface's.
         V = mesh.V if len(mesh.V) == len(certified.V) else certified.V
         flat = io.without_idle(V, certified.F, certified.uv)
@@ -137,7 +137,7 @@ def _flatten(options: argparse.Namespace, mesh: MeshData, began: float) -> pipel
         }
         worst = measured.statistics("isometric").maximum
         lines = [
-            pipeline.describe_maps(mapped, certified, options.output),
+            written_map.describe_maps(mapped, certified, options.output),
             *found.notes,
             f"maximum stretch {worst:.3g}",
         ]

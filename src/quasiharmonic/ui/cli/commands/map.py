@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import map_options, pipeline, process, report
+from quasiharmonic.ui.cli import map_options, pipeline, process, report, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_files,
     add_options,
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from quasiharmonic.problem import Problem
     from quasiharmonic.problem.result import MapResult
     from quasiharmonic.ui.cli.map_options import IslandProblem
-    from quasiharmonic.ui.cli.pipeline import WrittenMap
+    from quasiharmonic.ui.cli.written_map import WrittenMap
 
 
 def declare_arguments(parser: argparse.ArgumentParser) -> None:
@@ -156,7 +156,7 @@ def _map(
         new = new.with_places(map_options.pack_islands(options, io.mapped(new)))
 
     def describe(written: MeshData) -> pipeline.Account:
-        certified = pipeline.certify_map(written)
+        certified = written_map.certify_map(written)
         if options.plot is not None:
             problems = zip((one.fitted.problem for one in posed), refined, strict=False)
             draw(options.plot, certified, [on_refinement(*one) for one in problems], mapped, options.kind)
@@ -184,8 +184,8 @@ def _map(
             for island, one in zip(islands, mapped.islands, strict=False)
             if one.result.crowded.size
         ]
-        lines = [pipeline.describe_maps(mapped, certified, options.output), *notes]
-        lines += pipeline.describe_end(mapped, certified)
+        lines = [written_map.describe_maps(mapped, certified, options.output), *notes]
+        lines += written_map.describe_end(mapped, certified)
         return pipeline.Account(facts, lines, certified.injective)
 
     return pipeline.Changed(new, describe)

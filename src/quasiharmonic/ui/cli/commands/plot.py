@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from quasiharmonic.ui.cli import finite_elements, pipeline, report
+from quasiharmonic.ui.cli import finite_elements, report, written_map
 from quasiharmonic.ui.cli.arguments import MEASURES, add_options, choice, set_default, text
 from quasiharmonic.ui.cli.pipeline import CHECKERBOARD
 
@@ -92,5 +92,5 @@ def run(options: argparse.Namespace) -> int:
             texture = io.own_texture(mesh) if options.texture is None else image
             save_texture_figure(options.output, V, F, uv, texture=texture)
         else:
-            save_map_figure(options.output, V, F, uv, inverted=pipeline.certify_map(mesh).inverted)
+            save_map_figure(options.output, V, F, uv, inverted=written_map.certify_map(mesh).inverted)
     return report.tell_written(options.output)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import map_options, pipeline
+from quasiharmonic.ui.cli import map_options, pipeline, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_files,
     add_options,
@@ -125,7 +125,7 @@ def lower_distortion(
             after = lower(before, {**given, "callback": show})
 
         def describe(file: MeshData) -> pipeline.Account:
-            written = pipeline.certify_map(file)
+            written = written_map.certify_map(file)
             # Each map is cut at its own seams, which may differ.
             opened = reflect_mirrored(before).opened(), reflect_mirrored(after.mesh).opened()
             measured = [distortion(*io.without_idle(m.V, m.F, m.uv)) for m in opened if m.uv is not None]
@@ -137,9 +137,9 @@ def lower_distortion(
                 "distortion_before": measured[0].to_dict(),
                 "distortion": measured[1].to_dict(),
             }
-            lines = [pipeline.describe_maps(after, written, options.output)]
+            lines = [written_map.describe_maps(after, written, options.output)]
             if written.injective:
-                lines += [*notes, _change(options.energy, *measured), *pipeline.describe_end(after, written)]
+                lines += [*notes, _change(options.energy, *measured), *written_map.describe_end(after, written)]
             return pipeline.Account(facts, lines, written.injective)
 
         return pipeline.Changed(mesh.with_places(map_options.pack_islands(options, after.mesh)), describe)

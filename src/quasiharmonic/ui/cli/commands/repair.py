@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from quasiharmonic.ui.cli import pipeline
+from quasiharmonic.ui.cli import pipeline, written_map
 from quasiharmonic.ui.cli.arguments import add_files, add_options, count, flag, number, pick
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def _repair(options: argparse.Namespace, mesh: MeshData) -> pipeline.Changed:
         sizes = {"vertices": len(mesh.V), "triangles": len(mesh.F)}
         facts = {**result.to_dict(), "injective": verdict.injective, **sizes}
         account = pipeline.Account(facts, [f"wrote {options.output}: {result.summary()}"], verdict.injective)
-        pipeline.add_bent(account.facts, account.closing, repaired)
+        written_map.add_bent(account.facts, account.closing, repaired)
         return account
 
     return pipeline.Changed(repaired, describe)

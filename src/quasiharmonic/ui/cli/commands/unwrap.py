@@ -23,7 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import pipeline
+from quasiharmonic.ui.cli import pipeline, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_files,
     add_options,
@@ -225,7 +225,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
         if divided:
             lines.append(f"{count_of('polygon', 'polygons', divided)} written as triangles, because seams cross them")
         account = pipeline.Account(facts, lines, done)
-        pipeline.add_bent(account.facts, account.closing, unwrapped)
+        written_map.add_bent(account.facts, account.closing, unwrapped)
         if not same:
             account.closing.append(f"{options.output} has other coordinates than were certified")
         return account
