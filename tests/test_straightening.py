@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from quasiharmonic import unwrap
+from quasiharmonic.results import UnwrapStatus
 from quasiharmonic.surfaces import disk
+from quasiharmonic.util.progress import heartbeat
 from shared.closed_surfaces import torus
 
 AROUND, ALONG = 12, 9
@@ -155,3 +157,19 @@ def test_demanded_seams_divide_strips_and_given_seams_are_kept():
     assert [(strip.columns, strip.rows) for strip in result.strips] == [(AROUND, 3), (AROUND, ALONG - 3)]
     assert {*map(tuple, np.sort(across, axis=1).tolist())} <= {*map(tuple, result.seams.tolist())}
     assert shares_on_axes(result) == 1
+
+
+def test_strips_are_listed_after_a_time_limit(monkeypatch):
+    V, F = tube(bent)
+    other = disk(3)
+    points, triangles = np.concatenate([V, np.pad(other[0], [(0, 0), (0, 1)]) + 9]), [F, other[1] + len(V)]
+
+    def search(*arguments, **options):
+        while True:
+            heartbeat()
+
+    monkeypatch.setattr("quasiharmonic.apps.unwrapping.unwrap.find_charts", search)
+    result = unwrap(points, np.concatenate(triangles), resolution=512, straighten=True, time_limit=2)
+    assert result.status is UnwrapStatus.TIME_LIMIT
+    assert [strip.straightened for strip in result.strips] == [True]
+    assert shares_on_axes(result, slice(len(F))) == 1

@@ -16,6 +16,7 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart, mirror_charts
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart, keeps_bound
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
+from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import covers_once
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
@@ -48,6 +49,8 @@ class Draft:
         The triangles that are searched, if not all are. The charts above refer to these.
     others : sequence of Chart
         Charts of other triangles.
+    strips : sequence of Strip
+        Strips among these, and strips that stay as they are.
     """
 
     charts: Sequence[Chart] = ()
@@ -55,6 +58,7 @@ class Draft:
     mirror: Mirror | None = None
     rows: IntArray | None = None
     others: Sequence[Chart] = ()
+    strips: Sequence[Strip] = ()
 
     def keep(self, working: Sequence[WorkingChart]) -> None:
         """Replace the charts that are not finished."""

@@ -273,7 +273,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     density = None if density is None else float(np.ldexp(density, exponent))
     # Beside kept charts, there is no telling how long charts may be.
     given = density if kept is None else None
-    draft, grown, strips = Draft(), np.zeros(len(cleaned.F), dtype=bool), list[Strip]()
+    draft, grown = Draft(), np.zeros(len(cleaned.F), dtype=bool)
     left = None
     if wanted.time_limit is not None:
         spent = time.perf_counter() - began
@@ -287,7 +287,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         charts, grown = draft.complete(points, cleaned.F, rules.cost, rules.uv_cuts, bound)
         charts = divide_fragile(charts, points, rules.cost, bound=bound)
     else:
-        charts, strips = made
+        charts = made
     while True:
         report("pack")
         packing = place_charts(
@@ -347,7 +347,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         texels_per_unit=float(np.ldexp(packing.texels_per_unit, -exponent)),
         V=V,
         kept_charts=np.arange(len(certificate.bijective_charts)) >= len(charts),
-        strips=tuple(strip._replace(triangle=int(cleaned.triangles[strip.triangle])) for strip in strips),
+        strips=tuple(strip._replace(triangle=int(cleaned.triangles[strip.triangle])) for strip in draft.strips),
         symmetry=check_symmetry(rules.symmetry, rules.mirror, layout.chart),
         seconds=time.perf_counter() - began,
         unfinished=np.unique(layout.chart[grown]),
@@ -363,14 +363,14 @@ def _make_charts(
     density: float | None,
     draft: Draft,
     report: Callable[[str, int, int], object],
-) -> tuple[list[Chart], list[Strip]]:
-    """Return the charts of a cleaned mesh that keep the bound, and fit into the texture; and its strips."""
+) -> list[Chart]:
+    """Return the charts of a cleaned mesh that keep the bound, and fit into the texture."""
     bound, tiles, most = float(wanted.max_stretch), wanted.tiles, wanted.max_charts
     straight, strips = list[Chart](), list[Strip]()
     if wanted.straighten:
         straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
-    draft.rows, draft.others = np.flatnonzero(rest), straight
+    draft.rows, draft.others, draft.strips = np.flatnonzero(rest), straight, strips
     divide = partial(
         divide_long_charts,
         bound=bound,
@@ -399,8 +399,8 @@ def _make_charts(
         # Other charts stay, because they know their shapes.
         charts = [*straight, *(replace(chart, triangles=np.flatnonzero(rest)[chart.triangles]) for chart in charts)]
     if rules.uv is not None:
-        return sorted(charts, key=lambda chart: int(chart.triangles[0])), strips
-    return divide(charts, points, rules.cost), strips
+        return sorted(charts, key=lambda chart: int(chart.triangles[0]))
+    return divide(charts, points, rules.cost)
 
 
 def _corner_positions(uv: ArrayLike, F: IntArray, n: int) -> FloatArray:
