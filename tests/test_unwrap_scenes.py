@@ -208,6 +208,22 @@ def test_files_without_instances(tmp_path, capsys, options, words):
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--lightmap", "--texture", "checkerboard"), "omit --texture or --lightmap"),
+        (("--instances", "own", "--texture", "checkerboard"), "omit --texture or --instances"),
+        (("--lightmap", "--instances", "share"), "omit --instances share"),
+        (("--tile-by", "material"), "the file has no materials: omit --tile-by"),
+    ],
+)
+def test_options_that_exclude_each_other_are_named(tmp_path, capsys, words, message):
+    source = write_scene(tmp_path / "in.glb")
+    assert main(["unwrap", str(source), *words, "-o", str(tmp_path / "out.glb")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out.glb").exists()
+
+
 @pytest.mark.slow
 def test_a_thousand_small_meshes():
     meshes = [models.box(1, 1 + k / 1000, 1) for k in range(500)] + [
