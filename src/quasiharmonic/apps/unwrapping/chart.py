@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,9 +12,10 @@ from quasiharmonic.apps.atlas.packing.pack import find_copies
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
+from quasiharmonic.geometry.mesh.reference import area_vectors
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.geometry.mesh.topology import components
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, scale_to_unit
 from quasiharmonic.util.progress import heartbeat
 
 # Areas and moments of congruent components have at most this relative difference.
@@ -127,25 +128,27 @@ def _pair_charts(charts: list[Chart], mirror: Mirror | None) -> list[int]:
 def _number_copies(charts: list[Chart], V: FloatArray, F: IntArray) -> list[int]:
     """Return a number for each chart, the same only for charts of different components that are congruent.
 
-    Congruent components have equal numbers of vertices and triangles, areas, and moments. Congruent charts of one
+    Components count as congruent if they have equal numbers of triangles, areas, and moments. Congruent charts of one
     component have different numbers.
     """
     label = components(F, len(V))[F[:, 0]]
+    # In this unit, products neither overflow nor underflow.
+    V = scale_to_unit(V)
+    area, centre = np.linalg.norm(area_vectors(V, F), axis=1), V[F].mean(axis=1)
+    order = np.argsort(label, kind="stable")
     kinds = dict[int, int]()
-    known = list[tuple[int, FloatArray]]()
-    for component in np.unique(label).tolist():
-        rows = label == component
-        corners = V[F[rows]]
-        corners = corners - corners.mean(axis=(0, 1))
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area, centre = np.linalg.norm(normal, axis=1), corners.mean(axis=1)
-        moments = np.sqrt(np.maximum(np.linalg.eigvalsh(np.einsum("k,ki,kj->ij", area, centre, centre)), 0))
-        measures = np.array([area.sum(), *(moments * np.sqrt(area.sum()))])
-        near = _SAME_MEASURES * np.abs(measures).max()
-        count = int(np.count_nonzero(rows))
-        equal = (k for k, (n, other) in enumerate(known) if n == count and np.abs(other - measures).max() <= near)
-        kinds[component] = next(equal, len(known))
-        known.append((count, measures))
+    known = defaultdict[int, list[tuple[int, FloatArray]]](list)
+    for rows in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        whole, away = area[rows].sum(), centre[rows] - centre[rows].mean(axis=0)
+        moments = np.linalg.eigvalsh(np.einsum("k,ki,kj->ij", area[rows], away, away))
+        measures = np.array([whole, *np.sqrt(np.maximum(moments, 0) * whole)])
+        near = _SAME_MEASURES * measures.max()
+        alike = known[len(rows)]
+        same_kind = (kind for kind, other in alike if np.abs(other - measures).max() <= near)
+        component = int(label[rows[0]])
+        kinds[component] = next(same_kind, component)
+        if kinds[component] == component:
+            alike.append((component, measures))
     # Of congruent charts of a component, the k-th is stacked with the k-th of other components.
     same = find_copies([(chart.uv, chart.F) for chart in charts])
     ranks, numbers = Counter[tuple[int, int]](), dict[tuple[int, int, int], int]()
