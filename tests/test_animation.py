@@ -285,7 +285,7 @@ def test_the_command(head, tmp_path, capsys):
     io.write_obj(surface, io.MeshData(V, F))
     (tmp_path / "in").mkdir()
     for t, uv in enumerate(animation.uv):
-        io.write_obj(tmp_path / "in" / f"f{t}.obj", io.MeshData(V, F).with_map(uv))
+        io.write_obj(tmp_path / "in" / f"f{t + 8}.obj", io.MeshData(V, F).with_map(uv))
     np.save(tmp_path / "frames.npy", animation.uv)
     out, movie, report = tmp_path / "out", tmp_path / "movie.gif", tmp_path / "report.json"
     assert run("animate", surface, tmp_path / "in", "-o", out, "-o", movie, "--json", report) == 0

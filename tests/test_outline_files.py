@@ -27,6 +27,8 @@ AREA = targets.signed_area
             [81, -2, -0.5],
         ),
         ("1e-3 -2E+1\n+.5 1.\n3 3\n", [25.751]),
+        ('"x","y"\n"0","0"\n"9","0"\n"9","9"\n', [40.5]),
+        ('"0","0"\n"9","0"\n"9","9"\n', [40.5]),
     ],
 )
 def test_files_of_points(tmp_path, text, areas):

@@ -48,8 +48,6 @@ from quasiharmonic.util.arrays import (
 from quasiharmonic.util.options import UnwrapOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
-# Positions beyond this power of two, or all below its reciprocal, are scaled.
-_MAX_EXPONENT = 300
 # After a time limit, charts are completed and certified in about this multiple of the time of the preparation.
 _RESERVED = 2.0
 # Then so many charts are packed by their shapes, and further ones as boxes.
@@ -254,9 +252,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
 
     report("clean")
     whole = clean(V, F, wanted.outward, weld=wanted.weld, meshes=wanted.meshes)
-    # In this unit, areas neither overflow nor underflow.
+    # In this unit, powers of lengths neither overflow nor underflow.
     exponent = find_exponent(whole.V)
-    exponent = exponent if abs(exponent) > _MAX_EXPONENT else 0
     cleaned, kept = whole, None
     if wanted.faces is not None:
         if corner_uv is None:

@@ -12,6 +12,9 @@ from quasiharmonic.io.untrusted import is_number, number, read_text
 from quasiharmonic.targets.outlines.contours import MAX_POINTS, arrange, drop_close_points, is_collinear
 from quasiharmonic.util.arrays import FloatArray, check_integer, check_numbers, check_positive
 
+# Bytes between numbers in a file of points. Quotes count as such, too.
+_SEPARATORS = bytes.maketrans(b',;"', b"   ")
+
 
 def disk(radius: float = 1.0, points: int = 256) -> FloatArray:
     """Return the outline of a disk around the origin: an `ellipse` with equal axes.
@@ -174,7 +177,7 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
     Parameters
     ----------
     path : str or path-like
-        One point per line: x and y, separated by blanks, tabs, commas or semicolons. A blank line ends a contour, ``#``
+        One point per line: x and y, separated by blanks, tabs, commas or semicolons, perhaps in quotes. A blank line ends a contour, ``#``
         begins a comment, and the first line may be a heading such as ``x,y``. Contours are closed automatically; the
         first point may be repeated at the end.
 
@@ -194,7 +197,7 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
     starts, count = [0], 0
     for line, raw in enumerate(read_text(path).split(b"\n"), 1):
         text, comment, _ = raw.partition(b"#")
-        words = text.replace(b",", b" ").replace(b";", b" ").split()
+        words = text.translate(_SEPARATORS).split()
         if not words:
             # A comment line does not end a contour.
             if loops[-1] and not comment:

@@ -13,6 +13,7 @@ written; 3 written, but the report failed. Ctrl-C writes the frames so far.
 from __future__ import annotations
 
 import argparse
+import re
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,7 +51,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="FRAMES",
         help="targets of the fixed vertices: meshes with the same vertices and a map (vt), in order; or a folder of "
-        "them, by name; or a .npy array (frames, vertices, 2), of all vertices or of those that --fixed lists",
+        "them, by name (2 before 10); or a .npy array (frames, vertices, 2), of all vertices or of those that --fixed lists",
     )
     parser.add_argument(
         "-o",
@@ -146,7 +147,7 @@ def _files(given: list[Path]) -> list[Path]:
     if len(given) == 1 and given[0].is_dir():
         # Formats that are written with a map are read with one.
         accepted = suffixes("write_map")
-        found = sorted(path for path in given[0].iterdir() if path.suffix.lower() in accepted)
+        found = sorted((path for path in given[0].iterdir() if path.suffix.lower() in accepted), key=_in_order)
         if not found:
             raise ValueError(f"{given[0]}: no mesh in this folder ({', '.join(accepted)})")
         return found
@@ -155,6 +156,11 @@ def _files(given: list[Path]) -> list[Path]:
     if len(given) > 1 and any(path.suffix.lower() == ".npy" for path in given):
         raise ValueError("an .npy array has all frames: give no other file with it")
     return given
+
+
+def _in_order(path: Path) -> list[str | int]:
+    """Return a key that sorts files by name, with numbers by value: frame_2 comes before frame_10."""
+    return [int(part) if k % 2 else part for k, part in enumerate(re.split("([0-9]+)", path.name))]
 
 
 def _checked_folder(path: Path, inputs: tuple[Path | None, ...]) -> Path:
