@@ -177,9 +177,9 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
     Parameters
     ----------
     path : str or path-like
-        One point per line: x and y, separated by blanks, tabs, commas or semicolons, perhaps in quotes. A blank line ends a contour, ``#``
-        begins a comment, and the first line may be a heading such as ``x,y``. Contours are closed automatically; the
-        first point may be repeated at the end.
+        One point per line: x and y, separated by blanks, tabs, commas or semicolons, possibly in quotes. A blank line
+        ends a contour, ``#`` begins a comment, and the first line may be a heading such as ``x,y``. Contours are closed
+        automatically; the first point may be repeated at the end.
 
     Returns
     -------

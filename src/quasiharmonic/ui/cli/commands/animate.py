@@ -51,7 +51,8 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="FRAMES",
         help="targets of the fixed vertices: meshes with the same vertices and a map (vt), in order; or a folder of "
-        "them, by name (2 before 10); or a .npy array (frames, vertices, 2), of all vertices or of those that --fixed lists",
+        "them, by name (2 before 10); or a .npy array (frames, vertices, 2), of all vertices or of those that --fixed "
+        "lists",
     )
     parser.add_argument(
         "-o",
