@@ -286,6 +286,7 @@ def test_arrays_of_other_libraries(wrap):
         (lambda: flatten({"vertices": V}), "a dict is not a mesh, because it has no faces"),
         (lambda: flatten(SimpleNamespace(vertices=V, faces=[0, 1, 2])), "faces of a SimpleNamespace must have one row"),
         (lambda: flatten(SimpleNamespace(points=V, cells=[block("tetra", F)])), "cells of type 'tetra'"),
+        (lambda: flatten(SimpleNamespace(points=V, simplices=F[:, [0, 1, 2, 0]])), "simplices .* are tetrahedra"),
         (lambda: flatten(SimpleNamespace(points=V, cells=padded(F), celltypes=[10] * len(F))), "VTK type 10"),
         (lambda: flatten(SimpleNamespace(points=V, faces=padded(F + 99))), "the faces refers? to vert"),
         (lambda: flatten(V, F + 1), rf"vertex {len(V)}, but .*; if its indices count from 1, pass F - 1"),

@@ -68,6 +68,19 @@ def test_what_morph_writes_is_accepted(tmp_path, capsys):
     assert run(capsys, "check", out)[0] == 0
 
 
+def test_headings_and_quotes_of_positions(tmp_path, capsys):
+    points, F = grid(4, 4)
+    source, positions = write_vtk(tmp_path / "in.vtk", points, F, 5), tmp_path / "to.csv"
+    call = ["morph", str(source), "-o", str(tmp_path / "out.vtk"), "--positions", str(positions)]
+    for text in ("vertex,x,y\n0,-0.1,-0.1\n", '"Node";"X";"Y"\n"0";"-0,1";"-0,1"\n', '"0","-0.1","-0.1"\n'):
+        positions.write_text(text)
+        assert main(call) == 0
+    capsys.readouterr()
+    positions.write_text("vertex,y,x\n0,-0.1,-0.1\n")
+    assert main(call) == 2
+    assert "the columns are not in the order x, y" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "call",
     [

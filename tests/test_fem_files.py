@@ -237,6 +237,10 @@ def test_damaged_vtk_files_are_rejected(vtk, tmp_path, name, change, message):
             lambda d: re.sub(rb"\n2 1 2 (\d+)\n", rb"\n2 1 4 \1\n", d),
             "tetrahedron are not supported: use triangles of three or six",
         ),
+        (
+            lambda d: re.sub(rb"\n2 1 2 (\d+)\n", rb"\n2 1 21 \1\n", d),
+            "third-order triangle are not supported: use triangles of three or six",
+        ),
         (lambda d: re.sub(rb"\n2 1 2 \d+\n", rb"\n2 1 2 999999\n", d), "ends too early"),
     ],
 )

@@ -182,6 +182,15 @@ def test_the_barrier_has_the_stated_derivatives():
     assert check_energy(ThinBarrier(0.05, 3.0)).passed
 
 
+@pytest.mark.parametrize("unit", [1e-150, 1e-80, 1e80, 1e150])
+def test_the_unit_of_a_field_does_not_matter_to_its_inverse(unit):
+    field = nearest_invertible(wobble(20, 25, 12)).field
+    plain, same = inverse_field(field), inverse_field(field * unit, spacing=unit)
+    assert same.error < 1e-12 * unit
+    np.testing.assert_array_equal(same.outside, plain.outside)
+    np.testing.assert_allclose(same.field / unit, plain.field, atol=1e-12)
+
+
 @pytest.mark.parametrize("spacing", [1.0, (0.5, 3.0)])
 def test_field_and_inverse_cancel(spacing):
     field = nearest_invertible(wobble(40, 50, 25) * spacing, spacing=spacing).field

@@ -30,6 +30,19 @@ def dent(points, depth, waves=1):
     return upper, np.stack([x, 1 - depth * np.sin(waves * np.pi * x) ** 2], axis=1)
 
 
+# ---- second-order triangles ----------------------------------------------------------------------------------------
+
+
+def test_a_curved_triangle_is_valid_although_a_straight_one_is_inverted():
+    rest = [(0, 0), (1, 0), (0.5, 0.5), (0.5, 0), (0.75, 0.25), (0.25, 0.25)]
+    bent = np.array([(0, 0), (1, 0), (0.5, -0.01), (0.5, -0.3), (0.75, -0.08), (0.25, -0.08)])
+    moved = morph(rest, [[0, 1, 2, 3, 4, 5]], range(6), bent)
+    assert min_jacobian(bent) > 0
+    assert moved.success
+    assert moved.status is Status.INJECTIVE
+    assert "may overlap itself" in moved.summary()
+
+
 # ---- chains ---------------------------------------------------------------------------------------------------------
 
 

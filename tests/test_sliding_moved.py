@@ -22,6 +22,7 @@ from quasiharmonic.geometry.curves import Curve
 from quasiharmonic.io.fem.files import read_fem
 from quasiharmonic.ui.cli import main
 from shared.meshes import lift
+from shared.simulation import quadrilaterals, second_order
 from shared.sliding import SQUARE, lettered, off_the_glyph, points_of, sheared, z_of
 
 # Moved meshes
@@ -33,6 +34,42 @@ def channel(n=14):
     walls, body = sorted(boundary_loops(F, len(V)), key=lambda loop: -np.abs(V[loop]).max())
     turn = points_of(z_of(V[body]) * np.exp(0.5j))
     return V, F, walls, body, turn
+
+
+WALLS = [Curve.polyline([(0, 0), (0, 1)]), Curve.polyline([(1, 0), (1, 1)])]
+
+
+@pytest.mark.parametrize("depth", [0.124, 0.125, 0.5, 0.9])
+@pytest.mark.parametrize("slide", [True, BoundaryCurves([SQUARE]), BoundaryCurves(WALLS)])
+def test_nodes_of_the_walls_make_way_for_a_piston(depth, slide):
+    points, F = surfaces.grid(8, 8)
+    piston = np.flatnonzero(points[:, 1] == 1)
+    moved = morph(points, F, piston, points[piston] - [0, depth], slide=slide)
+    assert moved.success
+    np.testing.assert_allclose(moved.points, points * [1, 1 - depth], atol=1e-6)
+
+
+def test_elements_of_four_and_six_nodes_make_way_for_a_piston():
+    places, squares = quadrilaterals(6, 6)
+    curved, six = second_order(*surfaces.grid(5, 5))
+    for points, F in ((places, squares), (curved, six)):
+        piston = np.flatnonzero(points[:, 1] == points[:, 1].max())
+        moved = morph(points, F, piston, points[piston] - [0, 0.6 * np.ptp(points[:, 1])], slide=True)
+        assert moved.success
+        np.testing.assert_array_equal(np.abs(moved.points[:, 0]).max(), np.abs(points[:, 0]).max())
+
+
+def test_nodes_of_a_circle_make_way_along_it():
+    """The points from -60° to 60° turn by 30°, past unmoved ones on one side, and away from them on the other."""
+    V, F = surfaces.disk(10)
+    V = V[:, :2]
+    (loop,) = boundary_loops(F, len(V))
+    moved = loop[np.abs(np.angle(z_of(V[loop]))) < np.pi / 3]
+    turned = points_of(z_of(V[moved]) * np.exp(np.pi / 6 * 1j))
+    result = morph(V, F, moved, turned, slide=BoundaryCurves([Curve.circle()]))
+    assert result.success
+    np.testing.assert_array_equal(result.points[moved], turned)
+    np.testing.assert_allclose(np.linalg.norm(result.points[loop], axis=1), 1)
 
 
 @pytest.mark.slow

@@ -237,6 +237,13 @@ def test_a_tetrahedron_of_fixed_vertices_is_named():
     assert result.to_dict()["status"] == "impossible"
 
 
+def test_an_edge_of_fixed_vertices_at_one_position_is_named():
+    X, T = box(4, 4, 4)
+    result = injective_tetrahedra(X, T, [62, 63], [(0.5, 0.5, 0.5)] * 2)
+    assert result.status is TetrahedraStatus.IMPOSSIBLE
+    assert "Both ends of the edge 62–63 are fixed at one position." in result.summary()
+
+
 @pytest.mark.slow
 def test_a_vertex_without_a_position_is_named():
     """One inner vertex is joined to the whole surface of a body; of the bent body no point sees the whole surface."""

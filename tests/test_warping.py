@@ -51,6 +51,13 @@ def test_without_moved_landmarks_the_image_does_not_change():
         assert empty.image == pytest.approx(image, abs=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["uint8", "int64", "uint64"])
+def test_largest_and_smallest_integers_are_kept(kind):
+    for extreme in (np.iinfo(kind).max, np.iinfo(kind).min):
+        drawn = warp_by_landmarks(np.full((10, 12), extreme, dtype=kind), [[5, 5]], [[6, 5]], resolution=16)
+        assert (drawn.image == extreme).all()
+
+
 def test_a_moved_boundary():
     points, F = surfaces.grid(10, 10)
     upper = np.flatnonzero(points[:, 1] == 1)

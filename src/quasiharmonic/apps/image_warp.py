@@ -248,10 +248,18 @@ def warp_along(
         coordinates = np.ascontiguousarray(here[found, ::-1].T)
         for channel, layer in enumerate(layers):
             values = map_coordinates(layer, coordinates, output=np.float64, order=1, mode="nearest")
-            if pixels.dtype.kind in "iub":
-                values = np.rint(values)
-            drawn[start + found, channel] = values.astype(pixels.dtype)
+            drawn[start + found, channel] = _round_to(pixels.dtype, values)
     return drawn.reshape(height, width, *pixels.shape[2:])
+
+
+def _round_to(dtype: np.dtype[Any], values: FloatArray) -> NDArray[Any]:
+    """Convert values (k,) of an image to its type; integers are rounded, and largest ones stay the largest."""
+    if dtype.kind not in "iu":
+        return (np.rint(values) if dtype.kind == "b" else values).astype(dtype)
+    largest = np.iinfo(dtype).max
+    # The largest integers of 64 bits are not doubles: they are rounded up to a power of two, which does not fit.
+    is_largest = values >= float(largest)
+    return np.where(is_largest, largest, np.rint(np.where(is_largest, 0, values)).astype(dtype))
 
 
 def _check_image(image: ArrayLike) -> NDArray[Any]:

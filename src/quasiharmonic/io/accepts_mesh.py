@@ -72,6 +72,9 @@ def simulation_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
         solid = X.shape[1] == 3 and nodes in _DOLFINX_SOLIDS
         return X, F if solid or nodes not in _DOLFINX_ORDER else F[:, _DOLFINX_ORDER[nodes]]
     blocks = _blocks(given)
+    simplices: Any = getattr(given, "simplices", None)
+    if np.shape(simplices)[1:] == (4,):
+        blocks = [("tetra", simplices)]
     if blocks is None:
         return planar_arrays(mesh)
     if solids := [kind for kind, _ in blocks if kind in _SOLIDS]:

@@ -198,6 +198,8 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
             "a file, or the arrays V and F"
         )
     name = f"{faces} of {what}"
+    if faces == "simplices" and np.shape(_part(mesh, faces))[1:] == (4,):
+        raise ValueError(f"{name} are tetrahedra: only surface cells are supported")
     V = vertex_array(_part(mesh, positions), f"{positions} of {what}")
     return V, _triangles(V, name, _part(mesh, faces), _part(mesh, "celltypes"))
 

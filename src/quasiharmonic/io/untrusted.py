@@ -12,7 +12,7 @@ import os
 import re
 import stat
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from io import BytesIO
@@ -301,21 +301,24 @@ def read_pairs(path: str | os.PathLike[str], what: str) -> Iterator[tuple[int, l
         yield at, numbers
 
 
-def read_rows(path: str | os.PathLike[str], columns: int) -> list[tuple[int, list[float]]]:
+def read_rows(path: str | os.PathLike[str], columns: int, names: Sequence[bytes] = ()) -> list[tuple[int, list[float]]]:
     """Read lines with ``columns`` numbers each; return line numbers, counted from 1, and numbers.
 
-    Blanks, tabs and commas separate numbers. In a line with semicolons, semicolons separate numbers and commas are
-    decimal points, as in spreadsheets of many countries. Exponents have an e, or a d as in Fortran. A comment starts
-    with ``#``. A first line without numbers is a heading. MeshFileError if the file cannot be read, or a line has
-    another count of numbers or anything but finite numbers.
+    Blanks, tabs and commas separate numbers, which may be in quotes. In a line with semicolons, semicolons separate
+    numbers and commas are decimal points, as in spreadsheets of many countries. Exponents have an e, or a d as in
+    Fortran. A comment starts with ``#``. A first line without numbers is a heading. MeshFileError if the file cannot be read, or a line has
+    another count of numbers or anything but finite numbers, or the heading has the ``names`` in another order.
     """
     rows = []
-    for at, text in content_lines(read_text(path)):
+    for at, text in content_lines(read_text(path).replace(b'"', b"")):
         if b";" in text:
             words = [word.strip().replace(b",", b".") for word in text.split(b";")]
         else:
             words = text.replace(b",", b" ").split()
         if at == 1 and not any(is_number(word) for word in words):
+            named = [word.lower() for word in words if word.lower() in names]
+            if named != sorted(named, key=names.index):
+                raise MeshFileError(path, f"the columns are not in the order {b', '.join(names).decode()}", at)
             continue
         if len(words) != columns:
             raise MeshFileError(path, f"not {count_of('number', 'numbers', columns)}: {quote_token(text)}", at)

@@ -332,11 +332,16 @@ def loop_arrays(loops: Iterable[ArrayLike], n: int) -> list[IntArray]:
     return arrays
 
 
-def check_finite(name: str, one: str, many: str, rows: FloatArray) -> None:
-    """Raise a ValueError that names the first rows with NaN or infinite numbers; ``one``, ``many`` name a row."""
-    finite = np.isfinite(rows)
+def check_finite(name: str, one: str, many: str, rows: FloatArray, used: IntArray | None = None) -> None:
+    """Raise a ValueError that names the first rows with NaN or infinite numbers; ``one``, ``many`` name a row.
+
+    With ``used``, only these rows are checked.
+    """
+    finite = np.isfinite(rows).all(axis=1)
+    if used is not None:
+        finite |= ~mark(len(rows), used)
     if not finite.all():
-        which = names_of(one, many, np.flatnonzero(~finite.all(axis=1)))
+        which = names_of(one, many, np.flatnonzero(~finite))
         raise ValueError(f"{name} is not finite at {which}: give finite numbers")
 
 

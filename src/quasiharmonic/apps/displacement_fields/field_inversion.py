@@ -17,7 +17,7 @@ from quasiharmonic.apps.displacement_fields.nearest import is_fold_free
 from quasiharmonic.apps.displacement_fields.voxel_inversion import InverseVolume, inverse_volume
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.point_location import PointLocator
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_exponent
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +132,13 @@ class _Images:
 
     def source(self, points: FloatArray) -> FloatArray:
         """Return the source positions of points (m, 2), one point in each cell's image."""
-        away, twist = self.first - points, self.twist
-        t = _rising_root(
-            _cross(twist, self.down), _cross(self.along, self.down) + _cross(twist, away), _cross(self.along, away)
-        )
-        across = self.along + t[:, None] * twist
-        s = -np.einsum("mi,mi->m", away + t[:, None] * self.down, across) / np.einsum("mi,mi->m", across, across)
+        # In a unit in which products neither overflow nor underflow.
+        exponent = max(find_exponent(self.along), find_exponent(self.down))
+        vectors = (self.first - points, self.along, self.down, self.twist)
+        away, along, down, twist = (np.ldexp(vector, -exponent) for vector in vectors)
+        t = _rising_root(_cross(twist, down), _cross(along, down) + _cross(twist, away), _cross(along, away))
+        across = along + t[:, None] * twist
+        s = -np.einsum("mi,mi->m", away + t[:, None] * down, across) / np.einsum("mi,mi->m", across, across)
         return (self.corner + np.stack([np.clip(s, 0, 1), t], axis=1)) * self.spacing
 
     def forward(self, points: FloatArray) -> FloatArray:

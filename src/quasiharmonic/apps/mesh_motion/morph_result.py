@@ -38,7 +38,8 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
     result : MapResult
         The search: status, certificate, stages, seconds. Its ``uv`` has the nodes of the triangles that were searched,
         in their order. There are two triangles per quadrilateral. A six-node triangle is searched by its corners, and
-        its mid-side nodes are placed afterwards; if that fails, as four triangles with all nodes.
+        its mid-side nodes are placed afterwards; if that fails, as four triangles with all nodes. The certificate is
+        that of these triangles; curved elements can be valid although one of these triangles is inverted.
     quality_before, quality_after : (f,) float64
         `quasiharmonic.apps.mesh_motion.quality.element_quality` of every element: 1 for an equilateral triangle or a
         square, 0 without area, negative if inverted.
@@ -89,15 +90,19 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         as ``rest``, the drift is small and falls with ``tol``. It is large if the energy has several minima and
         the chain has reached another one.
         """
-        return float(np.hypot(*(self.points - self._one_step()).T).max())
+        used = np.unique(self.F)
+        return float(np.hypot(*(self.points[used] - self._one_step()[used]).T).max())
 
     def summary(self) -> str:
         """Return a text that says whether the mesh is valid, and otherwise what is wrong."""
         qualities = self.describe_quality()
         if self.valid:
             sound = f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.\n{qualities}"
-            bijective = self.result.certificate.bijective
-            return sound if bijective else f"{sound}\nThe mesh overlaps itself. {self.result.certificate.summary()}"
+            if self.result.certificate.bijective:
+                return sound
+            if self.F.shape[1] == 6:
+                return f"{sound}\nThe straight triangles between the nodes overlap, so the mesh may overlap itself."
+            return f"{sound}\nThe mesh overlaps itself. {self.result.certificate.summary()}"
         lines = [
             f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}. Move the boundary less or in "
             "several steps, and keep inner loops inside the outer loop."

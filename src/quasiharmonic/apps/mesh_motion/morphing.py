@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.mesh_motion.convex_quadrilaterals import make_convex
+from quasiharmonic.apps.mesh_motion.making_way import make_way
 from quasiharmonic.apps.mesh_motion.midsides import (
     centre_midsides,
     find_sides,
@@ -175,18 +176,26 @@ def morph(
     points = map_array("points", points, finite=False)
     F = element_array(F, len(points))
     used = np.unique(F)
-    _check_used("points", points, used)
+    check_finite("points", "vertex", "vertices", points, used)
     first = points if rest is None else _check_positions("rest", rest, points, used)
     begin = (None if rest is None else points) if start is None else _check_positions("start", start, points, used)
     F = _orient_counterclockwise(F, first)
     check_spread(F, len(points))
     fixed, goal = _find_fixed(points, F, moved_vertices, target)
+    if curves is not False:
+        there = points.copy()
+        there[fixed] = goal
+        loops = boundary_loops(nets_of(F)[-1], len(points))
+        goal = make_way(curves, loops, points, there, np.asarray(moved_vertices))[fixed]
     search = _NodeSearch(F, first, fixed, nets_of(F), checked)
     after, result = search.place(points, goal, begin, (curves, np.asarray(moved_vertices)))
     # Fix the boundary at the positions to which it has slid.
     alone = replace(search, options=replace(checked, callback=None, slide=False, rest=None, start=None))
     inverted = inverted_elements(F, after)
     forbidden = np.intersect1d(inverted, find_forbidden(F, after, fixed))
+    if not inverted.size and not result.injective and result.status.acceptable:
+        # Curved elements are valid although their straight triangles are not.
+        result = replace(result, status=Status.INJECTIVE, diagnosis=None)
     before, now = element_quality(F, points), element_quality(F, after)
     one_step = partial(alone.place_at_once, after[fixed])
     return MorphResult(after, F, inverted, forbidden, result, before, now, points.copy(), one_step)
@@ -284,14 +293,8 @@ class _NodeSearch:
 def _check_positions(name: str, mesh: ArrayLike, points: FloatArray, used: IntArray) -> FloatArray:
     """Check other positions of a mesh's nodes; nodes in no element may be anywhere."""
     array = map_array(name, mesh, len(points), finite=False)
-    _check_used(name, array, used)
+    check_finite(name, "vertex", "vertices", array, used)
     return array
-
-
-def _check_used(name: str, points: FloatArray, used: IntArray) -> None:
-    used_points = np.zeros_like(points)
-    used_points[used] = points[used]
-    check_finite(name, "vertex", "vertices", used_points)
 
 
 def _orient_counterclockwise(F: IntArray, rest: FloatArray) -> IntArray:

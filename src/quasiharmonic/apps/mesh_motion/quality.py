@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.elements import corner_triangles, element_rows, jacobian_coefficients, min_jacobian
-from quasiharmonic.util.arrays import FloatArray, IntArray, map_array
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, map_array
 
 
 def element_quality(F: ArrayLike, points: ArrayLike) -> FloatArray:
@@ -42,8 +42,9 @@ def element_quality(F: ArrayLike, points: ArrayLike) -> FloatArray:
     >>> element_quality([[0, 1, 2, 3]], [[0, 0], [1, 0], [1, 1], [0, 1]]).tolist()
     [1.0]
     """
-    points = map_array("points", points)
+    points = map_array("points", points, finite=False)
     F = element_rows(F, len(points))
+    check_finite("points", "vertex", "vertices", points, F)
     if F.shape[1] == 3:
         return mean_ratio(points, F)
     if F.shape[1] == 4:

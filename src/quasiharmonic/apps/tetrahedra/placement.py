@@ -344,7 +344,7 @@ def extend_harmonically(
         solved = cg(operator, load, rtol=1e-6, maxiter=2000, M=preconditioner)[0]
         displacement[free] = project(projections, solved.reshape(-1, 3))
     there = X + displacement
-    return there if np.isfinite(there).all() else X
+    return there if np.isfinite(there[T]).all() else X
 
 
 def _search(descent: TetrahedraDescent, options: TetrahedraOptions) -> tuple[FloatArray, TetrahedraStatus, int]:

@@ -273,8 +273,11 @@ def find_obstructions(
         )
         for k in whole.tolist()
     ]
+    edges = find_mesh_edges(T)
+    equal = edges[fixed[edges].all(axis=1) & (X[edges[:, 0]] == X[edges[:, 1]]).all(axis=1)]
+    for a, b in equal[:_MAX_LISTED].tolist():
+        found.append(TetrahedraObstruction(f"Both ends of the edge {a}–{b} are fixed at one position.", (a, b)))
     if boundary is not None:
-        edges = find_mesh_edges(T)
         sides = np.sort(boundary[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         n = len(X)
         inner = fixed[edges].all(axis=1) & ~np.isin(edges[:, 0] * n + edges[:, 1], sides[:, 0] * n + sides[:, 1])

@@ -22,7 +22,7 @@ from quasiharmonic.apps.tetrahedra.placement import (
 )
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
 from quasiharmonic.problem.result import Step
-from quasiharmonic.util.arrays import FloatArray, IntArray, fixed_vertices, reject, vertex_indices
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, fixed_vertices, reject, vertex_indices
 from quasiharmonic.util.options import MorphOptions, TetrahedraOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
@@ -98,7 +98,7 @@ def injective_tetrahedra(
     held = fixed_vertices(fixed, len(X))
     goal = space_array("target", target, held.size)
     checked = TetrahedraOptions(**options)
-    begin = None if checked.start is None else space_array("start", checked.start, len(X))
+    begin = None if checked.start is None else _check_positions("start", checked.start, mesh)
     return place_vertices(mesh, X, held, goal, begin, checked)
 
 
@@ -129,13 +129,20 @@ def morph_tetrahedra(
     )
     rest, start = options.rest, options.start
     points = space_array("points", points, finite=False)
-    first = points if rest is None else space_array("rest", rest, len(points), finite=False)
-    mesh = check_rest(T, first)
+    mesh = check_rest(T, points if rest is None else space_array("rest", rest, len(points), finite=False))
+    points = _check_positions("points", points, mesh)
     moved, still, sliding = find_fixed(mesh, points, moved_vertices, options.slide)
     goal = space_array("target", target, moved.size)
-    begin = (None if rest is None else points) if start is None else space_array("start", start, len(points))
+    begin = (None if rest is None else points) if start is None else _check_positions("start", start, mesh)
     fixed, goal = np.concatenate([moved, still]), np.concatenate([goal, points[still]])
     return place_vertices(mesh, points, fixed, goal, begin, checked, sliding)
+
+
+def _check_positions(name: str, X: ArrayLike, mesh: RestMesh) -> FloatArray:
+    """Return other positions (n, 3) of a mesh; vertices in no tetrahedron may be anywhere."""
+    array = space_array(name, X, len(mesh.X), finite=False)
+    check_finite(name, "vertex", "vertices", array, mesh.T)
+    return array
 
 
 def find_fixed(
@@ -161,7 +168,7 @@ class MovingTetrahedra:
     def __init__(
         self, points: ArrayLike, T: ArrayLike, moved_vertices: ArrayLike, settle: int, slide: bool | ArrayLike = False
     ) -> None:
-        self.points = space_array("points", points)
+        self.points = space_array("points", points, finite=False)
         self._mesh = check_rest(T, self.points)
         self._settle = settle
         self._moved, still, sliding = find_fixed(self._mesh, self.points, moved_vertices, slide)

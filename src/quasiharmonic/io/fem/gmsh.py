@@ -18,12 +18,17 @@ from quasiharmonic.util.arrays import FloatArray, IntArray
 
 # Number of nodes of each kind of element that is read, and of the kinds that are skipped: lines and points.
 _ELEMENTS = {2: 3, 3: 4, 9: 6}
-_POINTS_AND_LINES = {1: 2, 8: 3, 15: 1}
+_POINTS_AND_LINES = {1: 2, 8: 3, 15: 1, 26: 4, 27: 5, 28: 6}
 # The same for meshes in space, which may have elements of lower dimension on their boundary.
 _SOLIDS = {4: 4, 5: 8}
-_SURFACES = {**_ELEMENTS, 10: 9, 16: 8}
+_SURFACES = {**_ELEMENTS, 10: 9, 16: 8, 20: 9, 21: 10, 22: 12, 23: 15, 36: 16, 37: 25}
 # Dimension of each kind of element.
-_DIMENSIONS = {15: 0, **dict.fromkeys((1, 8), 1), **dict.fromkeys(_SURFACES, 2), **dict.fromkeys(_SOLIDS, 3)}
+_DIMENSIONS = {
+    15: 0,
+    **dict.fromkeys((1, 8, 26, 27, 28), 1),
+    **dict.fromkeys(_SURFACES, 2),
+    **dict.fromkeys(_SOLIDS, 3),
+}
 # Elements of a kind: the kind, the physical group (version 2) or entity (version 4) of each, and the tags of the nodes.
 _Block: TypeAlias = tuple[int, IntArray, IntArray]
 _NAMES = {
@@ -35,6 +40,12 @@ _NAMES = {
     11: "second-order tetrahedron",
     12: "second-order hexahedron",
     16: "second-order quadrangle",
+    20: "third-order triangle",
+    21: "third-order triangle",
+    22: "fourth-order triangle",
+    23: "fourth-order triangle",
+    36: "third-order quadrangle",
+    37: "fourth-order quadrangle",
 }
 
 

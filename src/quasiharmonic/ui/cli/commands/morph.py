@@ -303,7 +303,7 @@ def _positions(path: Path, n: int, axes: int) -> tuple[IntArray, FloatArray]:
     from quasiharmonic.io.untrusted import read_rows
 
     positions: dict[int, list[float]] = {}
-    for line, (vertex, *place) in read_rows(path, 1 + axes):
+    for line, (vertex, *place) in read_rows(path, 1 + axes, (b"x", b"y", b"z")[:axes]):
         if not (0 <= vertex < n and vertex.is_integer()):
             raise MeshFileError(
                 path,
