@@ -306,8 +306,9 @@ def read_rows(path: str | os.PathLike[str], columns: int, names: Sequence[bytes]
 
     Blanks, tabs and commas separate numbers, which may be in quotes. In a line with semicolons, semicolons separate
     numbers and commas are decimal points, as in spreadsheets of many countries. Exponents have an e, or a d as in
-    Fortran. A comment starts with ``#``. A first line without numbers is a heading. MeshFileError if the file cannot be read, or a line has
-    another count of numbers or anything but finite numbers, or the heading has the ``names`` in another order.
+    Fortran. A comment starts with ``#``. A first line without numbers is a heading. MeshFileError if the file cannot be
+    read, or a line has another count of numbers or anything but finite numbers, or the heading has the ``names`` in
+    another order.
     """
     rows = []
     for at, text in content_lines(read_text(path).replace(b'"', b"")):

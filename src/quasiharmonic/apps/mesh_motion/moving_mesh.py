@@ -300,8 +300,8 @@ class MovingMesh:
                 share = self._descent.move(goal, _TUNING.tolerance, steps=25)
             if share < 1:
                 raise RuntimeError(
-                    f"the boundary can be moved only {min(share, 0.999):.1%} of the way: then triangles become too small "
-                    "for such a step; use shorter steps, or a new mesh"
+                    f"the boundary can be moved only {min(share, 0.999):.1%} of the way: then triangles become too "
+                    "small for such a step; use shorter steps, or a new mesh"
                 )
             self._points = self._lower_energy()
         finally:
