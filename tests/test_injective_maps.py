@@ -11,7 +11,6 @@ from quasiharmonic import Problem, Status, boundary_loops, certify, injective_ma
 from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.problem.problem import set_up_batch
 from quasiharmonic.solver.methods import Newton, VectorAdam
 from quasiharmonic.solver.search import first_stage, many
 from quasiharmonic.solver.search.first_stage import Patterns, run_first_stage
@@ -335,65 +334,3 @@ def test_certificates_of_many_maps_are_those_of_each(rng):
     kinds = {(verdict.injective, verdict.bijective) for verdict in found}
     assert kinds == {(True, True), (True, False), (False, False)}
     assert certify_each([], [], []) == []
-
-
-class TestBatchedSetup:
-    """Problems created in one batch agree with `Problem`."""
-
-    def given(self):
-        V, F = random_annulus()
-        ring = np.concatenate(boundary_loops(F, len(V)))
-        made = [blob(30, 1), (V, F, ring, V[ring]), blob(40, 2), pinned(), blob(20, 3)]
-        return [tuple(np.array(part) for part in one) for one in made]
-
-    def test_problems_are_equal(self):
-        given = self.given()
-        given[2] = (1e90 * given[2][0], given[2][1].astype(np.int32), *given[2][2:])
-        for arrays, problem in zip(given, set_up_batch(given), strict=True):
-            alone = Problem(*arrays)
-            for name in ("V", "F", "fixed", "target"):
-                one, other = getattr(problem, name), getattr(alone, name)
-                assert one.dtype == other.dtype
-                assert not one.flags.writeable
-                np.testing.assert_array_equal(one, other)
-            for name in ("interior", "boundary", "inconsistent", "nonmanifold"):
-                np.testing.assert_array_equal(getattr(problem.domain.edges, name), getattr(alone.domain.edges, name))
-            assert [loop.tolist() for loop in problem.domain.loops] == [loop.tolist() for loop in alone.domain.loops]
-            assert problem.reference is None
-
-    @pytest.mark.parametrize(
-        ("which", "spoil"),
-        [
-            (0, lambda V: np.where(V.max() == V, np.nan, V)),
-            (0, lambda V: np.vstack([V, V[:1]])),
-            (0, lambda V: np.column_stack([V, 0 * V[:, 0]])),
-            (0, lambda V: V * [1, 0]),
-            (0, lambda V: V[:, 0]),
-            (1, lambda F: F + 1),
-            (1, lambda F: F - 1),
-            (1, lambda F: F[:, [0, 1, 1]]),
-            (1, lambda F: np.vstack([F, F[:1]])),
-            (1, lambda F: np.vstack([F[:1, ::-1], F[1:]])),
-            (1, lambda F: F.astype(float)),
-            (2, lambda fixed: fixed[[*range(len(fixed) - 1), 0]]),
-            (2, lambda fixed: fixed + 1000),
-            (2, lambda fixed: fixed[:-1]),
-            (3, lambda target: target[:-1]),
-            (3, lambda target: np.where(target == target.max(), np.inf, target)),
-        ],
-    )
-    def test_malformed_problems_are_left_to_others(self, which, spoil):
-        given = self.given()
-        given[2] = (*given[2][:which], spoil(given[2][which]), *given[2][which + 1 :])
-        assert set_up_batch(given) is None
-
-    def test_so_are_closed_and_disconnected_surfaces(self):
-        closed = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
-        V, F, fixed, target = blob(30, 1)
-        twice = np.concatenate([V, V + 5]), np.concatenate([F, F + len(V)])
-        none = np.empty(0, dtype=np.int64), np.empty((0, 2))
-        for odd in (
-            (np.random.default_rng(0).normal(size=(4, 2)), closed, *none),
-            (*twice, np.concatenate([fixed, fixed + len(V)]), np.concatenate([target, target + 5])),
-        ):
-            assert set_up_batch([*self.given(), odd]) is None

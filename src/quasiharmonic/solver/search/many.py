@@ -24,7 +24,6 @@ from quasiharmonic.energies.polishing import find_energy, polish_options, polish
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.objects import mesh_arrays, stands_for_mesh
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.problem import set_up_batch
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.search.first_stage import MAX_BATCH, SMALL, Patterns, group_by_first_stage, run_first_stage
 from quasiharmonic.solver.search.search import Search, finish_search, search_map
@@ -234,8 +233,7 @@ class _Worker:
 
     def solve(self, first: int, group: Sequence[Any]) -> list[MapResult | Exception]:
         """Return the result or the exception of each problem; ``first`` is the number of the first problem."""
-        ready = self._set_up_small(group)
-        posed = [self._set_up(first + k, given, ready.get(k)) for k, given in enumerate(group)]
+        posed = [self._set_up(first + k, given) for k, given in enumerate(group)]
         begun: dict[int, MapResult | Search] = {}
         problems = {k: one for k, one in enumerate(posed) if not isinstance(one, Exception)}
         for descent, keys in group_by_first_stage(problems, self._options.strategy):
@@ -246,29 +244,8 @@ class _Worker:
             for k, problem in enumerate(posed)
         ]
 
-    def _set_up_small(self, group: Sequence[Any]) -> dict[int, Problem]:
-        """Set up the problems with small meshes given as arrays together; return {} if one of them is invalid."""
-        if self._reference is not None:
-            return {}
-        new = dict[int, Any]()
-        before: Sequence[Any] | None = None
-        if self._last is not None:
-            before = self._last.V, self._last.F, self._last.fixed
-        for k, given in enumerate(group):
-            if isinstance(given, Problem):
-                continue
-            if not isinstance(given, Sequence) or len(given) != 4:
-                return {}
-            if not all(isinstance(array, np.ndarray) for array in given) or _count_triangles(given) > SMALL:
-                return {}
-            if before is None or not all(map(_is_same, before, given[:3])):
-                new[k] = given
-            before = given[:3]
-        posed = set_up_batch(list(new.values())) if len(new) > 1 else None
-        return {} if posed is None else dict(zip(new, posed, strict=True))
-
-    def _set_up(self, number: int, given: Any, ready: Problem | None) -> Problem | Exception:
-        """Set up a problem, on the previous problem's domain if it is the same, or use ``ready`` if it is given."""
+    def _set_up(self, number: int, given: Any) -> Problem | Exception:
+        """Set up a problem, on the previous problem's domain if it is the same."""
         self._check_wanted()
         if isinstance(given, Problem):
             return given
@@ -278,10 +255,10 @@ class _Worker:
             if not isinstance(given, Sequence) or len(given) != 4:
                 raise ValueError("give each as a Problem, as V, F, fixed, target or as mesh, fixed, target")
             V, F, fixed, target = given
-            last, reference = self._last, self._reference
+            last = self._last
             if last is not None and _is_same(last.V, V) and _is_same(last.F, F) and _is_same(last.fixed, fixed):
                 return last.with_target(target)
-            self._last = Problem(V, F, fixed, target, reference=reference) if ready is None else ready
+            self._last = Problem(V, F, fixed, target, reference=self._reference)
         except Exception as error:
             return _add_number(number, error)
         return self._last
