@@ -106,8 +106,8 @@ class TestAgreement:
             np.testing.assert_array_equal(a.uv, b.uv)
 
     @pytest.mark.slow
-    def test_merged_groups_continue_as_they_would_alone(self, monkeypatch):
-        """Some problems of several groups, of one mesh or of many, remain after the first iterations."""
+    def test_compacted_batches_continue_as_they_would_alone(self, monkeypatch):
+        """Some problems of several batches, of one mesh or of many, remain after the first iterations."""
         monkeypatch.setattr(first_stage, "MAX_BATCH", 900)
         stars = [star_problem(depth=0.15, points=6, n=150, seed=seed) for seed in range(5)]
         V, F, fixed, target = stars[0]
@@ -129,8 +129,8 @@ class TestAgreement:
                 if alone.injective:
                     np.testing.assert_allclose(one.uv, alone.uv, atol=1e-9)
 
-    def test_larger_portions_preserve_their_order(self, monkeypatch):
-        """A call takes increasing portions; 60 groups exceed the first ones, which are taken one by one."""
+    def test_many_groups_preserve_their_order(self, monkeypatch):
+        """A call takes 60 groups of one problem each."""
         for module in (many, first_stage):
             monkeypatch.setattr(module, "MAX_BATCH", 60)
         V, F, fixed, target = ellipses(1, 2)[0]

@@ -2,7 +2,7 @@
 
 A *group* has consecutive problems, which one thread solves. The first stage of its small problems runs in *batches*:
 the meshes of a batch are combined into one mesh (`quasiharmonic.solver.search.first_stage`). A group has at most as
-many triangles as four full batches, or it is one larger problem.
+many triangles as a full batch, or it is one larger problem.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypedDict, Unpack, get_args
+from typing import Any, TypedDict, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,20 +36,8 @@ from quasiharmonic.util.threads import count_cores, make_executor
 Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 
 
-class GroupTuning(NamedTuple):
-    """Numbers that tune groups of problems."""
-
-    # Maximum size of a group in full batches. The unsolved problems of these batches are joined after the first
-    # iterations.
-    batches: int = 4
-    # A group has at most this part (1 / `divisor`) of the triangles of all groups before it, so that no thread has much
-    # left while the others are idle. It may always have one full batch.
-    divisor: int = 8
-    # Seconds between two calls of the callback while no problem finishes, and between two checks for an interrupt.
-    tick: float = 0.2
-
-
-_TUNING = GroupTuning()
+# Seconds between two calls of the callback while no problem finishes, and between two checks for an interrupt.
+_TICK = 0.2
 
 
 class ManyKeywords(TypedDict, total=False):
@@ -191,7 +179,7 @@ def _wait_for(
     """Wait for the results of a group; meanwhile call the callback regularly and allow Ctrl-C."""
     while True:
         try:
-            return future.result(timeout=_TUNING.tick)
+            return future.result(timeout=_TICK)
         except NotYet:
             if callback is not None:
                 callback(done)
@@ -199,13 +187,11 @@ def _wait_for(
 
 def _group_problems(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
     """Yield the number of the first problem of each group and the problems of the group, in order."""
-    first, group, size, before = 0, list[Any](), 0, 0
+    first, group, size = 0, list[Any](), 0
     for given in problems:
         triangles = _count_triangles(given)
-        limit = MAX_BATCH * min(max(before // (_TUNING.divisor * MAX_BATCH), 1), _TUNING.batches)
-        if group and (size + triangles > limit or triangles > SMALL):
+        if group and (size + triangles > MAX_BATCH or triangles > SMALL):
             yield first, group
-            before += size
             first, group, size = first + len(group), [], 0
         group.append(given)
         size += triangles
