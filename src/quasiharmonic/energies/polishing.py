@@ -21,8 +21,8 @@ from quasiharmonic.energies.energies import (
     conformal_area_blend,
 )
 from quasiharmonic.energies.newton.distant_starts import descend
-from quasiharmonic.energies.newton.map_model import MapModel, in_units, newton_descent
-from quasiharmonic.energies.newton.newton_descent import NewtonDescent
+from quasiharmonic.energies.newton.map_model import MapModel, in_units
+from quasiharmonic.energies.newton.newton_descent import NewtonDescent, newton_descent
 from quasiharmonic.energies.newton.sliding_boundary import SlidingModel, move_boundary
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
