@@ -21,11 +21,10 @@ from quasiharmonic.util.arrays import (
     fixed_vertices,
     make_unchangeable,
     mark,
+    reject,
     scale_to_unit,
     triangle_array,
-    triangle_names,
     vertex_array,
-    vertex_names,
 )
 
 
@@ -135,20 +134,15 @@ class Domain(ReadOnly):
 
     def check_boundary_fixed(self) -> None:
         """Raise a ValueError with the boundary vertices that are not fixed, for methods that need all of them fixed."""
-        missing = np.flatnonzero(mark(self.n, self.edges.boundary) & ~mark(self.n, self.fixed))
-        if missing.size:
-            raise ValueError(
-                f"the boundary {vertex_names(missing)} not in fixed: every boundary vertex needs a target position"
-            )
+        missing = mark(self.n, self.edges.boundary) & ~mark(self.n, self.fixed)
+        message = "the boundary {} not in fixed: every boundary vertex needs a target position"
+        reject(missing, "vertex", "vertices", message)
 
     def check_areas(self) -> None:
         """Raise a ValueError with the triangles of zero rest area, for methods that use their shapes."""
+        remedy = "choose the reference 'equilateral', or remove them with clean"
         flat = flat_triangles(self.V, self.F)
-        if flat.size:
-            raise ValueError(
-                f"{triangle_names(flat)} of zero area in the rest mesh; "
-                "choose the reference 'equilateral', or remove them with clean"
-            )
+        reject(flat, "triangle", "triangles", f"{{}} of zero area in the rest mesh; {remedy}")
 
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:
         """Return the Laplacian of this mesh and these fixed vertices; it is analysed once and cached (§6.2, eq. 12).

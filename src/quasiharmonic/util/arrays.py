@@ -300,9 +300,8 @@ def vertex_indices(name: str, vertices: ArrayLike, n: int) -> IntArray:
 def fixed_vertices(fixed: ArrayLike, n: int) -> IntArray:
     """Convert indices of fixed vertices among ``n`` vertices to (k,) int64 without repetition; returns a copy."""
     array = vertex_indices("fixed", fixed, n)
-    times = np.bincount(array, minlength=n)
-    if times.max(initial=0) > 1:
-        raise ValueError(f"{vertex_names(np.flatnonzero(times > 1))} fixed more than once: list each vertex once")
+    message = "{} fixed more than once: list each vertex once"
+    reject(np.bincount(array, minlength=n) > 1, "vertex", "vertices", message)
     return array
 
 

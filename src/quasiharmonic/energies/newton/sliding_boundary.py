@@ -34,7 +34,7 @@ from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.geometry.exact.certificate import inverted_triangles, is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.problem import Domain, Problem
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, names_of
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, reject
 
 # Weight of the barrier, as a share of the current energy.
 _WEIGHT = 1e-2
@@ -49,12 +49,9 @@ def move_boundary(slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray) 
     Raise a ValueError as `BoundaryCurves.lay`, or if moving the boundary onto the curves inverts triangles.
     """
     track = sliding_curves(slide, domain.loops, uv).lay(domain.loops, uv)
-    inverted = inverted_triangles(domain.F, track.uv)
-    if inverted.size:
-        raise ValueError(
-            f"with the boundary moved onto its curves, {names_of('triangle', 'triangles', inverted)} inverted or "
-            "degenerate: find the map with the boundary on the curves (injective_map with slide, or qhm map --slide)"
-        )
+    remedy = "find the map with the boundary on the curves (injective_map with slide, or qhm map --slide)"
+    message = f"with the boundary moved onto its curves, {{}} inverted or degenerate: {remedy}"
+    reject(inverted_triangles(domain.F, track.uv), "triangle", "triangles", message)
     return track
 
 

@@ -35,6 +35,7 @@ from quasiharmonic.util.arrays import (
     edge_names,
     index_array,
     names_of,
+    reject,
     triangle_names,
 )
 
@@ -90,13 +91,13 @@ def _check_middles(F: IntArray) -> None:
     ends = np.sort(F[:, SIDES].reshape(-1, 2), axis=1)
     middle, first, number = np.unique(F[:, MIDDLES], return_index=True, return_inverse=True)
     differs = (ends != ends[first][number.ravel()]).any(axis=1)
-    if differs.any():
-        raise ValueError(
-            f"{names_of('node', 'nodes', middle[np.unique(number.ravel()[differs])])} between different "
-            f"corners in one triangle "
-            "than in another: a row of F needs the three corners, then the nodes between the first and the second, "
-            "the second and the third, the third and the first"
-        )
+    reject(
+        middle[np.unique(number.ravel()[differs])],
+        "node",
+        "nodes",
+        "{} between different corners in one triangle than in another: a row of F needs the three corners, then the "
+        "nodes between the first and the second, the second and the third, the third and the first",
+    )
 
 
 def check_spread(F: IntArray, n: int) -> None:

@@ -19,13 +19,12 @@ from quasiharmonic.util.arrays import (
     BoolArray,
     IntArray,
     check_range,
-    edge_names,
     first_equal,
     make_unchangeable,
     mark,
     own_triangles,
+    reject,
     repeat_each,
-    triangle_names,
     vertex_names,
 )
 from quasiharmonic.util.kernels import compiled
@@ -264,11 +263,8 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
     if number < 0:
         tails, heads = np.sort(boundary, axis=0).T
         shared = np.unique(tails[1:][tails[1:] == tails[:-1]])
-        if shared.size:
-            raise ValueError(
-                f"the boundary passes more than once through {vertex_names(shared)}; "
-                "inspect_mesh (qhm check) lists defects, and vertices at equal positions that may need to be merged"
-            )
+        remedy = "inspect_mesh (qhm check) lists defects, and vertices at equal positions that may need to be merged"
+        reject(shared, "vertex", "vertices", f"the boundary passes more than once through {{}}; {remedy}")
         unpaired = np.setxor1d(tails, heads)
         raise ValueError(
             f"the boundary does not close at {vertex_names(unpaired)}; orient all triangles alike with clean"
@@ -364,9 +360,7 @@ def surface_edges(F: IntArray, n: int) -> Edges:
     connected = not label.any()
     if not connected:
         # A vertex without triangle is a component of its own.
-        unused = np.setdiff1d(np.arange(n), F)
-        if unused.size:
-            raise ValueError(f"{vertex_names(unused)}: no triangle uses them; remove them")
+        reject(np.setdiff1d(np.arange(n), F), "vertex", "vertices", "{}: no triangle uses them; remove them")
     found = manifold_edges(F, n)
     if not found.boundary.size:
         raise ValueError(
@@ -391,28 +385,15 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
     # An edge from a vertex to itself is never interior, so only the other kinds of edges need a test.
     if found.nonmanifold.size or found.inconsistent.size or np.any(found.boundary[:, 0] == found.boundary[:, 1]):
         _check_triangles(F)
-    if found.nonmanifold.size:
-        raise ValueError(
-            f"{edge_names(found.nonmanifold)} in more than two triangles: not a surface; cut it open with clean, or "
-            "use unwrap, which does so"
-        )
-    if found.inconsistent.size:
-        raise ValueError(
-            f"mixed winding: {edge_names(found.inconsistent)} traversed in the same direction by both triangles; "
-            "orient all triangles alike with clean, or use unwrap, which does so"
-        )
+    crowded = "{} in more than two triangles: not a surface; cut it open with clean, or use unwrap, which does so"
+    reject(found.nonmanifold, "edge", "edges", crowded)
+    mixed = "mixed winding: {} traversed in the same direction by both triangles; orient all triangles alike with clean"
+    reject(found.inconsistent, "edge", "edges", f"{mixed}, or use unwrap, which does so")
     return found
 
 
 def _check_triangles(F: IntArray) -> None:
-    collapsed = np.flatnonzero(are_collapsed(F))
-    if collapsed.size:
-        raise ValueError(
-            f"{triangle_names(collapsed)}: a vertex is used twice in a triangle; remove such triangles with clean"
-        )
-
-    repeats = np.flatnonzero(find_twins(F) < np.arange(len(F)))
-    if repeats.size:
-        raise ValueError(
-            f"{triangle_names(repeats)} repeated: the same three vertices occur before; remove repetitions with clean"
-        )
+    message = "{}: a vertex is used twice in a triangle; remove such triangles with clean"
+    reject(are_collapsed(F), "triangle", "triangles", message)
+    message = "{} repeated: the same three vertices occur before; remove repetitions with clean"
+    reject(find_twins(F) < np.arange(len(F)), "triangle", "triangles", message)

@@ -32,11 +32,11 @@ from quasiharmonic.util.arrays import (
     describe,
     index_array,
     pad_to_space,
+    reject,
     scale_to_unit,
     to_complex,
     triangle_array,
     vertex_array,
-    vertex_names,
 )
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
@@ -119,11 +119,9 @@ class Pins:
             raise ValueError("corners must name boundary vertices by their integer indices")
         check_range("corners", vertices, n)
         alone, times = np.unique(vertices, return_counts=True)
-        if (times > 1).any():
-            raise ValueError(f"corners name {vertex_names(alone[times > 1])} more than once")
+        reject(alone[times > 1], "vertex", "vertices", "corners name {} more than once")
         inner = np.setdiff1d(alone, np.concatenate(self.loops))
-        if inner.size:
-            raise ValueError(f"{vertex_names(inner)} in corners, but not on the boundary")
+        reject(inner, "vertex", "vertices", "{} in corners, but not on the boundary")
 
     def along(self, loop: int, contour: int) -> list[tuple[int, float]]:
         """Return (position in the loop, parameter along its contour) for each pin, in order around the contour."""
