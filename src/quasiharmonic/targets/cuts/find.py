@@ -222,7 +222,7 @@ def side_costs(edge_costs: ArrayLike, count: int) -> FloatArray:
     costs = real_array("edge_costs", edge_costs)
     if costs.shape != (count, 3):
         raise ValueError(f"edge_costs must have shape ({count}, 3), not {costs.shape}")
-    wrong: BoolArray = ~((costs > 0) & np.isfinite(costs)).all(axis=1)
+    wrong = np.flatnonzero(~((costs > 0) & np.isfinite(costs)).all(axis=1))
     reject(wrong, "triangle", "triangles", "edge_costs must be positive and finite: {}")
     return costs
 
