@@ -51,7 +51,7 @@ from quasiharmonic.util.arrays import (
     make_unchangeable,
     vertex_names,
 )
-from quasiharmonic.util.outcome import Displayable, Verdict
+from quasiharmonic.util.outcome import Displayable, Verdict, as_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -178,15 +178,10 @@ class Certificate(ReadOnly, Displayable, Verdict):
         """Return the certificate in plain Python types, fit for JSON; each loop as its first vertex and its length."""
         return {
             **super().to_dict(),
-            "injective": self.injective,
-            "triangles": self.triangles,
-            "inverted": self.inverted.tolist(),
-            "degenerate": self.degenerate.tolist(),
-            "nonfinite": self.nonfinite.tolist(),
+            **as_plain(self, "injective", "triangles", "inverted", "degenerate", "nonfinite"),
             "reasons": [{"kind": r.kind.value, "text": r.text, "loops": list(r.loops)} for r in self.reasons],
             "loops": [{"start": int(loop[0]), "length": len(loop)} for loop in self.loops],
-            "crossings": self.crossings.tolist(),
-            "multiply_wound": self.multiply_wound.tolist(),
+            **as_plain(self, "crossings", "multiply_wound"),
             "summary": self.summary(),
         }
 

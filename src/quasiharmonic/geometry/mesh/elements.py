@@ -27,7 +27,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.topology import edges
+from quasiharmonic.geometry.mesh.topology import edges, find_sides
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -191,9 +191,8 @@ def corner_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
 def rim(F: IntArray) -> IntArray:
     """Ascending nodes on sides that belong to one element only; the orientation of elements does not matter."""
     triangles, _ = covering_triangles(F)
-    pairs = np.sort(triangles[:, SIDES].reshape(-1, 2), axis=1)
-    found, count = np.unique(pairs, axis=0, return_counts=True)
-    return np.unique(found[count == 1])
+    pairs, side = find_sides(triangles, int(triangles.max(initial=-1)) + 1)
+    return np.unique(pairs[np.bincount(side.ravel()) == 1])
 
 
 def reverse_elements(F: IntArray) -> IntArray:

@@ -16,17 +16,11 @@ import numpy as np
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import Status
+from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from quasiharmonic.solver.field.objective import Iterate, Objective
-from quasiharmonic.util.arrays import ComplexArray
-from quasiharmonic.util.options import (
-    FUNCTIONALS,
-    PARAMETERISATIONS,
-    Options,
-    one_of,
-    option,
-    positive,
-    reference_name,
-)
+from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
+from quasiharmonic.util.arrays import ComplexArray, check_choice
+from quasiharmonic.util.options import Options, option, positive, reference_name
 
 Iterates: TypeAlias = Generator[Iterate, None, bool]
 
@@ -218,7 +212,7 @@ class TensorDescent(Descent):
         be an early one that is far from any solution.)
     """
 
-    parameterisation: str = option("tanh", check=one_of(*PARAMETERISATIONS))
+    parameterisation: str = option("tanh", check=lambda name, value: check_choice(name, value, PARAMETERISATIONS))
     reference: Reference = option("equilateral", check=reference_name)
     iterations: int = option(1000, check=positive)
     patience: ClassVar[tuple[int, float] | None] = (300, 1e-3)
@@ -256,7 +250,7 @@ class FunctionalDescent(TensorDescent):
         A name of `quasiharmonic.solver.field.functionals.FUNCTIONALS`: the functional to descend (§7.3).
     """
 
-    functional: str = option("dirichlet", check=one_of(*FUNCTIONALS))
+    functional: str = option("dirichlet", check=lambda name, value: check_choice(name, value, FUNCTIONALS))
 
     @property
     def name(self) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.curves.arcs import nearest_on_segments
+from quasiharmonic.geometry.exact.loops import join_items
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.io.untrusted import integer
@@ -167,8 +168,7 @@ class Pins:
     def _list_corners(self, contour: int) -> str:
         """List the corners of a contour with their numbers, for messages."""
         points = np.ldexp(self.contours[contour][self.sharp[contour]], self.exponent).tolist()
-        named = [f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)]
-        return ", ".join(named[: self._MAX_LISTED]) + (", …" if len(named) > self._MAX_LISTED else "")
+        return join_items([f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)], self._MAX_LISTED)
 
     def _find_on_outline(self, point: FloatArray, vertex: int) -> tuple[int, float]:
         """Return the contour on which a point lies and the parameter along it."""
