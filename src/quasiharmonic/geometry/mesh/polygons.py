@@ -235,27 +235,25 @@ def triangulate(corners: list[Point]) -> list[Triangle]:
     return sweep.triangles
 
 
+@dataclass(slots=True, eq=False)
 class _Link:
     """Element of a chain. When a chain is split, its rightmost corner gets two elements."""
 
-    __slots__ = ("above", "below", "corner")
-
-    def __init__(self, corner: int) -> None:
-        self.corner = corner
-        self.below: _Link | None = None
-        self.above: _Link | None = None
+    corner: int
+    below: _Link | None = None
+    above: _Link | None = None
 
 
+@dataclass(slots=True, eq=False)
 class _Interval:
     """Interval of the sweep line between two sides of the polygon."""
 
-    __slots__ = ("bottom", "last", "side", "top")
-
-    def __init__(self, side: tuple[int, int], bottom: _Link, last: _Link, top: _Link) -> None:
-        # The side of the polygon below, from left to right.
-        self.side = side
-        # The ends of the chain, and its rightmost corner, the one that came last.
-        self.bottom, self.last, self.top = bottom, last, top
+    # The side of the polygon below, from left to right.
+    side: tuple[int, int]
+    # The ends of the chain, and its rightmost corner, the one that came last.
+    bottom: _Link
+    last: _Link
+    top: _Link
 
 
 class _Sweep:

@@ -23,7 +23,7 @@ from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.prolongation import prolong
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Domain, Frame, Problem
-from quasiharmonic.problem.result import MapResult, Stage, Status
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import finish
 from quasiharmonic.solver.methods import Descent, LineShift, Newton, Untangling, VectorAdam
 from quasiharmonic.solver.methods.base import SearchState
@@ -211,16 +211,8 @@ class Search(SearchRecord):
                     if status is not Status.INTERRUPTED:
                         self.work.record(*self.best)
         finally:
-            self.work.stages.append(
-                Stage(
-                    name=f"{name}, {len(problem.F)} triangles",
-                    n_iterations=max(len(self.work.history) - done, 0),
-                    seconds=time.perf_counter() - began,
-                    inverted=(before.best[0], self.best[0]),
-                    energy=(before.best[1], self.best[1]),
-                    kept=self.best != before.best,
-                )
-            )
+            name, seconds = f"{name}, {len(problem.F)} triangles", time.perf_counter() - began
+            self.record_stage(name, done, seconds, before.best, self.best != before.best)
         if status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         if self.best != before.best and self.best[0]:
