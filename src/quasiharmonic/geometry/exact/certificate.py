@@ -288,28 +288,3 @@ def _find_loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
 
 def _edge_names(pairs: IntArray) -> list[str]:
     return [f"{i}–{j}" for i, j in pairs.tolist()]
-
-
-def certify_each(
-    F: Sequence[IntArray], uv: Sequence[FloatArray], loops: Sequence[Sequence[IntArray]]
-) -> list[Certificate]:
-    """Certify maps exactly; each result equals that of `certify`.
-
-    The loops are those of `boundary_loops`, not checked.
-    """
-    if not F:
-        return []
-    vertices = np.cumsum([0, *map(len, uv)])
-    triangles = np.cumsum([0, *map(len, F)])
-    positions = np.concatenate(uv)
-    good = np.array([len(rims) == 1 for rims in loops]) & (np.diff(triangles) > 0)
-    bad = inverted_triangles(np.concatenate([T + first for T, first in zip(F, vertices[:-1], strict=True)]), positions)
-    good[np.searchsorted(triangles, bad, side="right") - 1] = False
-    candidates = np.flatnonzero(good)
-    if candidates.size:
-        rims = [loops[k][0] + vertices[k] for k in candidates.tolist()]
-        good[candidates] = simple_loops(rims, positions)
-    return [
-        Certificate(F[k], uv[k], True, loops=tuple(loops[k])) if good[k] else certify(F[k], uv[k], loops=loops[k])
-        for k in range(len(F))
-    ]

@@ -18,12 +18,11 @@ from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain, Problem
-from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.problem.result import Status
 from quasiharmonic.solver.field.objective import (
     Iterate,
     Objective,
@@ -34,11 +33,11 @@ from quasiharmonic.solver.field.objective import (
     sums_of,
     sweep,
 )
-from quasiharmonic.solver.field.tensor import TANH, Parameterisation, TensorField
+from quasiharmonic.solver.field.tensor import TANH, TensorField
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.methods.relocation import RetrySchedule, relocate_each
 from quasiharmonic.solver.search.record import Round, StageRun, visit_rounds
-from quasiharmonic.solver.search.search import Search, result_of
+from quasiharmonic.solver.search.search import Search
 from quasiharmonic.solver.search.stages import Stages, stages_of
 from quasiharmonic.util.arrays import ComplexArray, IntArray, repeat_each
 from quasiharmonic.util.options import MapOptions
@@ -181,7 +180,7 @@ def _is_plain(stage: object) -> TypeGuard[VectorAdam]:
 
 def run_first_stage(
     problems: Sequence[Problem], descent: VectorAdam, patterns: Patterns, options: MapOptions
-) -> list[MapResult | Search | None]:
+) -> list[Search | None]:
     """Run the first stage of many searches in batches.
 
     Parameters
@@ -198,8 +197,8 @@ def run_first_stage(
     Returns
     -------
     list
-        For each problem its result, or the search after the stage. None if rounding broke the factorisation of its
-        batch; a new search must then begin.
+        For each problem the search after the stage, to be completed by `finish_search`. None if rounding broke the
+        factorisation of its batch; a new search must then begin.
     """
     members = []
     searches = [Search(problem, options) for problem in problems]
@@ -208,17 +207,9 @@ def run_first_stage(
         members.append(_BatchMember(run, descent.objective(problem, options.linear_solver), RetrySchedule()))
     for first, last in _divide([member.size for member in members]):
         _BatchDescent(members[first:last], descent, patterns).run()
-    runs = [member.run for member in members]
-    for run in runs:
-        run.end(Status.OUT_OF_ITERATIONS)
-    results = iter(_certify([run for run in runs if run.status is Status.INJECTIVE]))
-    found: list[MapResult | Search | None] = []
-    for run, search in zip(runs, searches, strict=True):
-        if run.status is Status.INJECTIVE:
-            found.append(next(results))
-        else:
-            found.append(None if run.status is Status.UNSOLVABLE else search)
-    return found
+    for member in members:
+        member.run.end(Status.OUT_OF_ITERATIONS)
+    return [None if search.status is Status.UNSOLVABLE else search for search in searches]
 
 
 class _BatchMember(NamedTuple):
@@ -326,29 +317,3 @@ def _divide(sizes: Sequence[int]) -> list[tuple[int, int]]:
             first, total = k, 0
         total += size
     return [*portions, (first, len(sizes))] if sizes else []
-
-
-def _certify(runs: Sequence[StageRun]) -> list[MapResult]:
-    """Certify the maps of solved searches together and return the results."""
-    searches = [run.search for run in runs]
-    problems = [search.problem for search in searches]
-    uv = [search.problem.positions(search.best_map) for search in searches]
-    certificates = certify_each([problem.F for problem in problems], uv, [problem.domain.loops for problem in problems])
-    mu = _beltrami_coefficients([search.best_field for search in searches if search.best_field is not None])
-    parts = zip(runs, uv, certificates, mu, strict=True)
-    return [
-        result_of(run.search, positions, certificate, own, run.seconds) for run, positions, certificate, own in parts
-    ]
-
-
-def _beltrami_coefficients(fields: Sequence[TensorField]) -> list[ComplexArray]:
-    """Return the Beltrami coefficients of each field, computed together."""
-    mu = [np.empty(0, dtype=np.complex128)] * len(fields)
-    alike: dict[Parameterisation, list[int]] = {}
-    for k, field in enumerate(fields):
-        alike.setdefault(field.parameterisation, []).append(k)
-    for parameterisation, indices in alike.items():
-        whole = parameterisation.field(np.concatenate([fields[k].xi for k in indices])).mu
-        for k, own in zip(indices, np.split(whole, np.cumsum([fields[k].xi.size for k in indices])[:-1]), strict=True):
-            mu[k] = own.copy()
-    return mu

@@ -26,7 +26,7 @@ from quasiharmonic.io.objects import mesh_arrays, stands_for_mesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.search.first_stage import MAX_BATCH, SMALL, Patterns, group_by_first_stage, run_first_stage
-from quasiharmonic.solver.search.search import Search, finish_search, search_map
+from quasiharmonic.solver.search.search import Search, finish_search
 from quasiharmonic.solver.search.stages import STRATEGIES, Stages
 from quasiharmonic.util.arrays import check_callback, check_choice, check_integer, check_sequence
 from quasiharmonic.util.options import MapOptions, takes
@@ -220,7 +220,7 @@ class _Worker:
     def solve(self, first: int, group: Sequence[Any]) -> list[MapResult | Exception]:
         """Return the result or the exception of each problem; ``first`` is the number of the first problem."""
         posed = [self._set_up(first + k, given) for k, given in enumerate(group)]
-        begun: dict[int, MapResult | Search] = {}
+        begun: dict[int, Search] = {}
         problems = {k: one for k, one in enumerate(posed) if not isinstance(one, Exception)}
         for descent, keys in group_by_first_stage(problems, self._options.strategy):
             outcomes = run_first_stage([problems[k] for k in keys], descent, self._patterns, self._options)
@@ -249,15 +249,10 @@ class _Worker:
             return _add_number(number, error)
         return self._last
 
-    def _finish(self, number: int, problem: Problem, begun: MapResult | Search | None) -> MapResult | Exception:
-        """Complete the search for one problem, from its result or its search after the first stage."""
+    def _finish(self, number: int, problem: Problem, begun: Search | None) -> MapResult | Exception:
+        """Complete the search for one problem, which may have had its first stage."""
         try:
-            if isinstance(begun, MapResult):
-                result = begun
-            elif begun is None:
-                result = search_map(problem, self._options)
-            else:
-                result = finish_search(begun, self._options.strategy, begun.work.stages[0].seconds)
+            result = finish_search(begun or Search(problem, self._options), self._options.strategy)
             if self._options.polish is not None and result.status is Status.INJECTIVE:
                 result = polish_result(problem, result, polish_options(self._options))
             if result.status is Status.INTERRUPTED:

@@ -1,8 +1,7 @@
 """Solve small problems of a data set together, in one worker process.
 
 For meshes of some hundred triangles the overhead of NumPy calls exceeds the computation. So several problems are read,
-their first search stages run in a batch (`quasiharmonic.solver.search.first_stage`), and their maps are certified
-together.
+and their first search stages run in a batch (`quasiharmonic.solver.search.first_stage`).
 A problem solved here gets the same map and record as alone. All other problems are left untouched and solved
 individually: unreadable files, meshes with several islands, large meshes, and searches that need more than one stage.
 Failures here therefore cost only time.
@@ -23,8 +22,9 @@ from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.result import MapResult
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.search.first_stage import SMALL, Patterns, group_by_first_stage, run_first_stage
+from quasiharmonic.solver.search.search import finish_search
 from quasiharmonic.ui.batch import island_problems, memory, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
@@ -150,9 +150,11 @@ def _solve_first_stage(problems: dict[int, Problem], settings: dict[str, Any]) -
         patterns = Patterns(solver_for(problems[some[0]], settings["linear_solver"]))
         options = MapOptions(max_iterations=settings["max_iterations"], linear_solver=settings["linear_solver"])
         found = run_first_stage([problems[k] for k in some], descent, patterns, options)
-        for k, result in zip(some, found, strict=True):
-            if isinstance(result, MapResult) and result.injective:
-                yield k, result
+        for k, search in zip(some, found, strict=True):
+            if search is not None and search.status is Status.INJECTIVE:
+                result = finish_search(search, search_stages(settings))
+                if result.injective:
+                    yield k, result
 
 
 def _read_map(mesh: io.MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
