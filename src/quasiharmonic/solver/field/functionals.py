@@ -34,7 +34,7 @@ from typing import Protocol
 import numpy as np
 
 from quasiharmonic.geometry.mesh.reference import Derivatives, ReferenceMesh
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, pair_keys
 from quasiharmonic.linsolve.laplacian import FactoredLaplacian, Laplacian
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.tensor import TensorField
@@ -201,12 +201,11 @@ class EdgePoisson(DualFunctional):
     def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
         super().__init__(problem, mesh)
         F, n = problem.F, problem.n
-        opposite = edge_keys(F[:, (1, 2, 0)], F[:, (2, 0, 1)], n)
-        keys, number = np.unique(opposite, return_inverse=True)
+        ends, side = find_sides(F, n)
         #: Edge opposite to each corner, (f, 3).
-        self._edges = number.reshape(-1, 3)
+        self._edges = side[:, (1, 2, 0)]
         self._tail, self._head = problem.domain.edges.boundary.T
-        self._boundary_edges = np.searchsorted(keys, edge_keys(self._tail, self._head, n))
+        self._boundary_edges = np.searchsorted(pair_keys(ends, n), edge_keys(self._tail, self._head, n))
         # The same triangles with separate corners.
         self._separate_mesh = copy(mesh)
         self._separate_mesh.F = np.arange(F.size).reshape(-1, 3)

@@ -13,7 +13,7 @@ The method requires a single boundary loop with a simple image.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import islice
 from typing import ClassVar
 
@@ -62,14 +62,8 @@ class Composite(VectorAdam):
             return bool((yield from steps))
         there = objective.near_map(w)
         yield there
-        nearby = VectorAdam(
-            functional=self.functional,
-            parameterisation=self.parameterisation,
-            iterations=left,
-            schedule=self.schedule or NEARBY_STEPS,
-            momenta=self.momenta,
-            relocation=self.relocation,
-        )
+        shared = {one.name: getattr(self, one.name) for one in fields(VectorAdam)}
+        nearby = VectorAdam(**shared | {"iterations": left, "schedule": self.schedule or NEARBY_STEPS})
         return (yield from nearby.iterates(objective, there))
 
 
