@@ -214,9 +214,10 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
         if len(points) > MAX_POINTS:
             raise MeshFileError(path, f"more than {MAX_POINTS:,} points", line, "use fewer points")
     contours, begins = [], []
-    for _, loop in groupby(points, key=itemgetter(0)):
-        _, start, first = next(loop)
-        contour = drop_close_points(np.array([first, *(position for _, _, position in loop)]), 0.0)
+    for _, group in groupby(points, key=itemgetter(0)):
+        loop = list(group)
+        start, positions = loop[0][1], np.array([position for _, _, position in loop])
+        contour = drop_close_points(positions, 0.0)
         if len(contour) < 3 or is_collinear(contour):
             what = f"a contour of {len(contour)} different points that encloses no area begins"
             raise MeshFileError(path, what, start, "use blank lines only between contours")
