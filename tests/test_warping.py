@@ -254,12 +254,13 @@ def test_one_or_two_landmarks_suffice():
 def test_the_plate_energy_has_the_stated_gradient():
     V, F = surfaces.grid(5, 4)
     dice = np.random.default_rng(0)
-    plate = Plate(V, F, np.array([7, 8, 13]), 0.3, Pull(np.array([8]), np.array([[0.4, 0.1]]), np.array([2.0])))
+    pull, unit = Pull(np.array([8]), np.array([[0.4, 0.1]]), np.array([2.0])), 0.5
+    plate = Plate(V, F, np.array([7, 8, 13]), 0.3, pull, unit)
     w, step = dice.normal(size=(2, len(V), 2)).view(np.complex128)[..., 0]
     slope = (plate.value(w + 1e-3 * step) - plate.value(w - 1e-3 * step)) / 2e-3
     assert slope == pytest.approx(np.vdot(plate.gradient(w), step).real, rel=1e-9)
     bend = plate.value(w + step) - 2 * plate.value(w) + plate.value(w - step)
-    assert bend == pytest.approx(2 * np.vdot(step, plate.matrix() @ step).real, rel=1e-9)
+    assert bend == pytest.approx(2 * unit**2 * np.vdot(step, plate.matrix() @ step).real, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP, AreaBarrier, Combination
-from quasiharmonic.energies.newton.map_model import in_units, newton_descent
+from quasiharmonic.energies.newton.map_model import in_units
+from quasiharmonic.energies.newton.newton_descent import newton_descent
 from quasiharmonic.geometry.exact.certificate import Certificate, certify, is_injective
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.topology import boundary_loops

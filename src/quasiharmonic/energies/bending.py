@@ -56,13 +56,13 @@ class Pull:
 
 
 class Plate:
-    """The second-order term and the pulls, a quadratic function of the positions.
+    """The second-order term and the pulls: a quadratic `Term` for maps in multiples of ``unit``.
 
     ``V`` (n, 2) are the rest positions. The second derivatives are evaluated at the vertices ``inside`` (m,).
     ``length`` is ℓ.
     """
 
-    def __init__(self, V: FloatArray, F: IntArray, inside: IntArray, length: float, pull: Pull) -> None:
+    def __init__(self, V: FloatArray, F: IntArray, inside: IntArray, length: float, pull: Pull, unit: float) -> None:
         n = len(V)
         rest_operators = operators(V, F)
         L = rest_operators.laplacian()[inside]
@@ -74,7 +74,7 @@ class Plate:
         towards = np.zeros((n, 2))
         towards[pull.vertices] = pull.positions
         self.second_order: csr_array = csr_array(L.T @ (L * (length**2 / area / mass)[:, None]))
-        self.weight, self.towards = weight, to_complex(towards)
+        self.weight, self.towards, self.unit = weight, to_complex(towards), unit
 
     def matrix(self) -> csr_array:
         """Matrix K (n, n) of the quadratic form ``Re xᴴ K x`` in displacements x."""
@@ -83,13 +83,17 @@ class Plate:
         return csr_array(self.second_order + pulls)
 
     def value(self, w: ComplexArray) -> float:
-        """Value of the term for a map (n,) complex128."""
-        u, deviation = w - self.rest, w - self.towards
+        """See `Term`."""
+        u, deviation = self.unit * w - self.rest, self.unit * w - self.towards
         return float(np.vdot(u, self.second_order @ u).real + np.sum(self.weight * np.abs(deviation) ** 2))
 
     def gradient(self, w: ComplexArray) -> ComplexArray:
-        """Derivative of the term, ``∂/∂u + i ∂/∂v``; (n,) complex128."""
-        return 2 * (self.second_order @ (w - self.rest) + self.weight * (w - self.towards))
+        """See `Term`."""
+        u, deviation = self.unit * w - self.rest, self.unit * w - self.towards
+        return self.unit * (2 * (self.second_order @ u + self.weight * deviation))
+
+    def add_to(self, system: NewtonSystem, w: ComplexArray) -> None:
+        """See `Term`; nothing, because `PlateSystem` contains the constant matrix."""
 
 
 class PlateSystem(NewtonSystem):
@@ -121,24 +125,6 @@ class PlateSystem(NewtonSystem):
         self.solver.factor(values)
 
 
-class PlateTerm:
-    """A `Plate` as a `Term` for maps in multiples of ``unit``; `PlateSystem` has its second derivatives."""
-
-    def __init__(self, plate: Plate, unit: float) -> None:
-        self._plate, self._unit = plate, unit
-
-    def value(self, w: ComplexArray) -> float:
-        """See `Term`."""
-        return self._plate.value(self._unit * w)
-
-    def gradient(self, w: ComplexArray) -> ComplexArray:
-        """See `Term`."""
-        return self._unit * self._plate.gradient(self._unit * w)
-
-    def add_to(self, system: NewtonSystem, w: ComplexArray) -> None:
-        """See `Term`; nothing, because the system contains the constant matrix."""
-
-
 def bend_map(
     domain: Domain,
     result: MapResult,
@@ -156,15 +142,15 @@ def bend_map(
     max_steps = 200
     run = Run()
     inside = list_others(domain.n, np.concatenate(domain.loops))
-    plate = Plate(domain.V, domain.F, inside, length, pull)
     # As in `polish`, steps to inf or NaN are never accepted.
     with np.errstate(all="ignore"):
         deformation, exponent = scale_energy(domain, result.uv, find_energy(energy))
         unit = float(np.ldexp(1.0, exponent))
+        plate = Plate(domain.V, domain.F, inside, length, pull, unit)
         constant = csr_array(2 * unit**2 * plate.matrix())
         system = PlateSystem(deformation.F, deformation.g, domain.n, domain.fixed, constant)
         coordinates = Coordinates.of(result.uv, domain.fixed, exponent)
-        model = MapModel(deformation, coordinates, system, [PlateTerm(plate, unit)])
+        model = MapModel(deformation, coordinates, system, [plate])
         descent = NewtonDescent(model, model.evaluate(in_units(result.uv, exponent)))
     status = Status.INTERRUPTED
     with run.until_interrupted():

@@ -32,6 +32,7 @@ from quasiharmonic.util.arrays import (
     names_of,
     own_triangles,
     real_array,
+    reject,
 )
 from quasiharmonic.util.kernels import compiled
 
@@ -99,9 +100,8 @@ class DeformationEnergy:
         self.share: FloatArray = shapes.m / total
         if weights is not None:
             array = _weight_array(weights, len(self.F))
-            bad = np.flatnonzero(~((array >= 0) & (array < np.inf)))
-            if bad.size:
-                raise ValueError(f"the weight is negative or not finite at {names_of('triangle', 'triangles', bad)}")
+            bad = ~((array >= 0) & (array < np.inf))
+            reject(bad, "triangle", "triangles", "the weight is negative or not finite at {}")
             self.share = self.share * array
         self._det_per_area = scale**2 / shapes.m
 
@@ -321,9 +321,7 @@ def positive_weights(weights: ArrayLike, f: int) -> FloatArray:
     Raise a ValueError if the shape is wrong or a weight is not positive; the message names the first triangles.
     """
     array = _weight_array(weights, f)
-    bad = np.flatnonzero(~(array > 0))
-    if bad.size:
-        raise ValueError(f"the weight is not positive at {names_of('triangle', 'triangles', bad)}")
+    reject(~(array > 0), "triangle", "triangles", "the weight is not positive at {}")
     return array
 
 

@@ -21,8 +21,8 @@ from quasiharmonic.energies.energies import (
     conformal_area_blend,
 )
 from quasiharmonic.energies.newton.distant_starts import descend
-from quasiharmonic.energies.newton.map_model import MapModel, in_units, newton_descent
-from quasiharmonic.energies.newton.newton_descent import NewtonDescent
+from quasiharmonic.energies.newton.map_model import MapModel, in_units
+from quasiharmonic.energies.newton.newton_descent import NewtonDescent, newton_descent
 from quasiharmonic.energies.newton.sliding_boundary import SlidingModel, move_boundary
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
@@ -31,7 +31,7 @@ from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run, run_within
-from quasiharmonic.util.arrays import FloatArray, IntArray, describe, find_exponent, map_array, names_of
+from quasiharmonic.util.arrays import FloatArray, IntArray, describe, find_exponent, map_array, reject
 from quasiharmonic.util.hints import suggest
 from quasiharmonic.util.options import MapOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
@@ -270,11 +270,8 @@ def scale_energy(
 def check_injective(domain: Domain, uv: ArrayLike, why: str) -> FloatArray:
     """Return a map as float64 and check that it is injective; ``why`` ends the error message."""
     array = map_array("uv", uv, domain.n)
-    inverted = inverted_triangles(domain.F, array)
-    if inverted.size:
-        raise ValueError(
-            f"uv is not injective: {names_of('triangle', 'triangles', inverted)} inverted or degenerate; {why}"
-        )
+    message = f"uv is not injective: {{}} inverted or degenerate; {why}"
+    reject(inverted_triangles(domain.F, array), "triangle", "triangles", message)
     return array
 
 

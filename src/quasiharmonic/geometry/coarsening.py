@@ -207,8 +207,7 @@ def _adds_new_edges(T: IntArray, n: int, candidates: list[IntArray]) -> list[Boo
     other = np.concatenate([rings[2:-1].T.ravel() for rings in candidates])
     claims = edge_keys(apex, other, n)
     # Existing edges that may be claimed: from an apex to a vertex that is to get an edge to an apex.
-    tails, heads = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-    tails[apex], heads[other] = True, True
+    tails, heads = mark(n, apex), mark(n, other)
     remains = []
     for tail, head in zip(T, T[(1, 2, 0), :], strict=True):
         at = np.flatnonzero(tails.take(tail) & heads.take(head))

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import Delaunay
 
+from quasiharmonic.geometry.mesh.topology import find_sides
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -319,10 +320,9 @@ def refine(V: ArrayLike, F: ArrayLike) -> tuple[FloatArray, IntArray]:
     """
     V = vertex_array(V)
     F = triangle_array(F, len(V))
-    sides = np.sort(np.stack([F, F[:, [1, 2, 0]]], axis=2).reshape(-1, 2), axis=1)
-    pairs, which = np.unique(sides, axis=0, return_inverse=True)
+    pairs, side = find_sides(F, len(V))
     # Corners a, b, c and the midpoints of ab, bc, ca are columns 0 to 5.
-    six = np.concatenate([F, len(V) + which.reshape(-1, 3)], axis=1)
+    six = np.concatenate([F, len(V) + side], axis=1)
     quarters = six[:, [0, 3, 5, 3, 1, 4, 5, 4, 2, 3, 4, 5]].reshape(-1, 3)
     return np.concatenate([V, V[pairs].mean(axis=1)]), quarters
 

@@ -11,7 +11,6 @@ import time
 from abc import ABC, abstractmethod
 from functools import cache
 from importlib.util import find_spec
-from types import TracebackType
 from typing import ClassVar, Self
 
 import numpy as np
@@ -292,9 +291,7 @@ class LinearSolver(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _require_open(self) -> None:

@@ -116,18 +116,8 @@ class Laplacian:
     def _refactor(self, operator: FactoredLaplacian) -> None:
         """Make the solver's factor that of ``operator``. The caller holds the lock."""
         self._factored = None
-        pattern = self._pattern
-        assemble(
-            operator.stiffness,
-            pattern.indptr,
-            pattern.row,
-            pattern.column,
-            pattern.halves,
-            pattern.offsets,
-            pattern.border,
-            pattern.border_row,
-            self._values,
-        )
+        # All fields except the indices and the fixed ends.
+        assemble(operator.stiffness, self._pattern.indptr, *self._pattern[2:8], self._values)
         self.solver.factor(self._values)
         self._factored = operator
 

@@ -65,8 +65,9 @@ class Rslab(LinearSolver):
         self._fallback: LinearSolver | None = None
         self._is_analysed = False
 
-    def _find_symbolic(self) -> Any:
-        """Analyse the pattern; None if rslab fails."""
+    def _analyse_late(self) -> bool:
+        if self._is_analysed:
+            return False
         # Supernodes with fewer columns are merged. Half of rslab's default saves up to a tenth of factor and solve
         # times.
         nemin = 8
@@ -75,16 +76,12 @@ class Rslab(LinearSolver):
         # The upper triangle by rows is the lower triangle by columns, which rslab reads.
         pattern = csc_matrix((np.ones(self.nnz), self._indices, self._indptr), shape=(self.n, self.n))
         threads = 1 if self.n < SEQUENTIAL_BELOW else _threads()
-        return self._try(
+        self._symbolic = self._try(
             lambda: library().analyze(
                 pattern, path="ldlt", ordering=_ORDERING, nemin=nemin, threads=threads, solve_par_min_work=_NEVER
             )
         )
-
-    def _analyse_late(self) -> bool:
-        if self._is_analysed:
-            return False
-        self._symbolic, self._is_analysed = self._find_symbolic(), True
+        self._is_analysed = True
         return True
 
     def _factor(self) -> None:

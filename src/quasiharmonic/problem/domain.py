@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from threading import Lock
 from typing import Any
 
@@ -21,11 +22,10 @@ from quasiharmonic.util.arrays import (
     fixed_vertices,
     make_unchangeable,
     mark,
+    reject,
     scale_to_unit,
     triangle_array,
-    triangle_names,
     vertex_array,
-    vertex_names,
 )
 
 
@@ -64,21 +64,11 @@ class Domain(ReadOnly):
     """
 
     def __init__(self, V: ArrayLike, F: ArrayLike, fixed: ArrayLike | None) -> None:
-        V = vertex_array(V)
-        F = make_unchangeable(triangle_array(F, len(V)))
-        edges = surface_edges(F, len(V))
-        fixed = fixed_vertices(np.unique(edges.boundary) if fixed is None else fixed, len(V))
-        self._assemble(V, F, fixed, edges, trace_loops(edges.boundary))
-
-    @classmethod
-    def from_parts(cls, V: FloatArray, F: IntArray, fixed: IntArray, edges: Edges, loops: list[IntArray]) -> Domain:
-        """Return a domain of checked arrays, which it owns, with their edges and boundary loops."""
-        domain = object.__new__(cls)
-        domain._assemble(V, F, fixed, edges, loops)
-        return domain
-
-    def _assemble(self, V: FloatArray, F: IntArray, fixed: IntArray, edges: Edges, loops: list[IntArray]) -> None:
-        self.V, self.F, self.fixed, self.edges, self.loops = V, F, fixed, edges, loops
+        self.V: FloatArray = vertex_array(V)
+        self.F: IntArray = make_unchangeable(triangle_array(F, self.n))
+        self.edges: Edges = surface_edges(self.F, self.n)
+        self.fixed: IntArray = fixed_vertices(np.unique(self.edges.boundary) if fixed is None else fixed, self.n)
+        self.loops: list[IntArray] = trace_loops(self.edges.boundary)
         self._seal()
         self._empty_caches()
 
@@ -106,7 +96,7 @@ class Domain(ReadOnly):
         Without the copy, two threads, or a solve inside another solve's callback, would refactor alternately.
         """
         if not self._lock.acquire(blocking=False):
-            yield Domain.from_parts(self.V, self.F, self.fixed, self.edges, self.loops)
+            yield copy(self)
             return
         try:
             yield self
@@ -135,20 +125,15 @@ class Domain(ReadOnly):
 
     def check_boundary_fixed(self) -> None:
         """Raise a ValueError with the boundary vertices that are not fixed, for methods that need all of them fixed."""
-        missing = np.flatnonzero(mark(self.n, self.edges.boundary) & ~mark(self.n, self.fixed))
-        if missing.size:
-            raise ValueError(
-                f"the boundary {vertex_names(missing)} not in fixed: every boundary vertex needs a target position"
-            )
+        missing = mark(self.n, self.edges.boundary) & ~mark(self.n, self.fixed)
+        message = "the boundary {} not in fixed: every boundary vertex needs a target position"
+        reject(missing, "vertex", "vertices", message)
 
     def check_areas(self) -> None:
         """Raise a ValueError with the triangles of zero rest area, for methods that use their shapes."""
+        remedy = "choose the reference 'equilateral', or remove them with clean"
         flat = flat_triangles(self.V, self.F)
-        if flat.size:
-            raise ValueError(
-                f"{triangle_names(flat)} of zero area in the rest mesh; "
-                "choose the reference 'equilateral', or remove them with clean"
-            )
+        reject(flat, "triangle", "triangles", f"{{}} of zero area in the rest mesh; {remedy}")
 
     def laplacian(self, linear_solver: str = "auto") -> Laplacian:
         """Return the Laplacian of this mesh and these fixed vertices; it is analysed once and cached (§6.2, eq. 12).

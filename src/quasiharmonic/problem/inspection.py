@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.geometry.exact.loops import join_items
 from quasiharmonic.geometry.mesh.reference import flat_triangles
 from quasiharmonic.geometry.mesh.splitting import fans, find_representatives
 from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, boundary_edges, edges, find_twins, trace_loops
@@ -29,6 +30,7 @@ from quasiharmonic.util.arrays import (
     triangle_rows,
     vertex_array,
 )
+from quasiharmonic.util.outcome import as_plain
 
 # Vertices are close if their distance is at most this multiple of the diagonal of the bounding box.
 _CLOSE = 1e-6
@@ -110,16 +112,10 @@ class MeshReport:
         if self.inward:
             inward = count_of("closed component", "closed components", self.inward)
             lines.append(f"{inward} with triangles facing inwards")
-        if self.welded.size:
-            lines.append(
-                f"{count_of('vertex', 'vertices', self.welded.size)} welded to an earlier vertex, "
-                f"first {_name_first(self.welded)}"
-            )
-        if self.coincident.size:
-            lines.append(
-                f"{count_of('vertex', 'vertices', self.coincident.size)} at the position of an earlier vertex, "
-                f"first {_name_first(self.coincident)}"
-            )
+        for found, where in ((self.welded, "welded to"), (self.coincident, "at the position of")):
+            if found.size:
+                vertices = count_of("vertex", "vertices", found.size)
+                lines.append(f"{vertices} {where} an earlier vertex, first {_name_first(found)}")
         if self.close.size:
             lines.append(describe_soup(self.close))
         return "\n".join([*lines, *(tabulate_elements("defect", self.defects) or ["no defects"])])
@@ -127,9 +123,7 @@ class MeshReport:
     def to_dict(self) -> dict[str, Any]:
         """Return the report for JSON."""
         return {
-            "vertices": self.vertices,
-            "triangles": self.triangles,
-            "components": self.components,
+            **as_plain(self, "vertices", "triangles", "components"),
             "closed_components": self.closed,
             "boundary_loops": self.loops,
             "genus": self.genus,
@@ -338,7 +332,6 @@ def _volumes(V: FloatArray, F: IntArray, part: IntArray, count: int) -> FloatArr
 
 def _name_first(found: IntArray) -> str:
     """Name the first elements."""
-    # Maximum number of elements that the text lists for a class of defects.
-    listed_at_most = 5
-    listed = (str(tuple(one)) if isinstance(one, list) else str(one) for one in found[:listed_at_most].tolist())
-    return ", ".join(listed) + (", …" if len(found) > listed_at_most else "")
+    # One more than the text lists.
+    first = found[:6].tolist()
+    return join_items([tuple(one) if isinstance(one, list) else one for one in first])

@@ -15,7 +15,7 @@ from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.io.objects import make_trimesh
 from quasiharmonic.util.arrays import ReadOnly, count_of
-from quasiharmonic.util.outcome import Displayable, Outcome
+from quasiharmonic.util.outcome import Displayable, Outcome, as_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -492,22 +492,14 @@ class MapResult(ReadOnly, Displayable, Outcome):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report of ``--json``: all data except the map itself, in plain Python types."""
-        return {
+        report = {
             **super().to_dict(),
-            "injective": self.injective,
-            "linear_solver": self.linear_solver,
-            "stages": [stage.to_dict() for stage in self.stages],
+            **as_plain(self, "injective", "linear_solver", "stages"),
             "history": [
                 vars(step) | {"energy": step.energy if math.isfinite(step.energy) else None} for step in self.history
             ],
-            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
-            **(self._refinement() if self.refinement_attempts else {}),
+            **as_plain(self, "diagnosis"),
         }
-
-    def _refinement(self) -> dict[str, Any]:
-        """Return the part of the report about refinement."""
-        return {
-            "added_vertices": self.added,
-            "refinement_attempts": [attempt.to_dict() for attempt in self.refinement_attempts],
-            "crowded": self.crowded.tolist(),
-        }
+        if self.refinement_attempts:
+            report |= {"added_vertices": self.added, **as_plain(self, "refinement_attempts", "crowded")}
+        return report

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -146,8 +146,7 @@ def finish(compute: Callable[[], T]) -> tuple[T, bool]:
 
     A second interrupt propagates.
     """
-    run = Run()
-    with run.until_interrupted():
+    with suppress(KeyboardInterrupt):
         return compute(), False
     return compute(), True
 

@@ -6,7 +6,7 @@ functions raise a ValueError that names the argument and the first elements that
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from numbers import Integral, Number, Real
 from os import PathLike, fspath
 from typing import Any, TypeVar, cast
@@ -136,6 +136,18 @@ def enumerate_each(counts: ArrayLike) -> tuple[IntArray, IntArray]:
     return repeat_each(np.arange(counts.size), counts), np.arange(counts.sum()) - repeat_each(
         np.cumsum(counts) - counts, counts
     )
+
+
+def enumerate_ranges(begin: IntArray, end: IntArray, limit: int) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield the pairs of a range (k,) and a number in it, in order; at most ``limit`` or one range at a time."""
+    count = end - begin
+    total = np.cumsum(count)
+    start = done = 0
+    while start < begin.size:
+        stop = max(int(np.searchsorted(total, done + limit, side="right")), start + 1)
+        which = repeat_each(np.arange(start, stop), count[start:stop])
+        yield which, np.arange(done, int(total[stop - 1])) + (end - total)[which]
+        start, done = stop, int(total[stop - 1])
 
 
 def mark(n: int, *chosen: IntArray) -> BoolArray:
@@ -300,9 +312,8 @@ def vertex_indices(name: str, vertices: ArrayLike, n: int) -> IntArray:
 def fixed_vertices(fixed: ArrayLike, n: int) -> IntArray:
     """Convert indices of fixed vertices among ``n`` vertices to (k,) int64 without repetition; returns a copy."""
     array = vertex_indices("fixed", fixed, n)
-    times = np.bincount(array, minlength=n)
-    if times.max(initial=0) > 1:
-        raise ValueError(f"{vertex_names(np.flatnonzero(times > 1))} fixed more than once: list each vertex once")
+    message = "{} fixed more than once: list each vertex once"
+    reject(np.bincount(array, minlength=n) > 1, "vertex", "vertices", message)
     return array
 
 

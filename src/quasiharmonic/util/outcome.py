@@ -25,6 +25,8 @@ def as_plain(owner: object, *names: str) -> dict[str, Any]:
 
 
 def _make_plain(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_make_plain(one) for one in value]
     for convert in ("tolist", "to_dict"):
         if hasattr(value, convert):
             return getattr(value, convert)()

@@ -17,8 +17,8 @@ from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Energy, QuadraticForm
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.line_search import RotationPath, backtrack, extend, rates
-from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, NewtonObjective, in_units
-from quasiharmonic.energies.newton.newton_descent import IteratedDescent, NewtonState
+from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, NewtonObjective, NewtonState, in_units
+from quasiharmonic.energies.newton.newton_descent import IteratedDescent
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem.result import Status
@@ -157,19 +157,19 @@ class SurfaceModel(MapModel):
         return False
 
     def assemble(self, state: NewtonState, negative: float) -> None:
-        """See `NewtonModel`."""
+        """See `MapModel`."""
         super().assemble(state, negative)
         if self._pairs is not None:
             self._pairs.add_to(self.system, state.w)
 
     def solve(self, load: ComplexArray) -> ComplexArray:
-        """See `NewtonModel`."""
+        """See `MapModel`."""
         return super().solve(load) if self._pairs is None else self._pairs.solve(self.system, load)
 
     def search(
         self, state: NewtonState, direction: ComplexArray, expected_decrease: float, shortened: bool
     ) -> tuple[NewtonState, bool] | None:
-        """See `NewtonModel`; after several slow full steps, first try a path along which triangles rotate."""
+        """See `MapModel`; after several slow full steps, first try a path along which triangles rotate."""
         course: _StepRecord = state.extra
         less = expected_decrease > _TUNING.slow_decrement * course.decrease
         less = less and state.value > _TUNING.slow_energy * course.value
@@ -269,14 +269,14 @@ class GuardedModel(SurfaceModel):
         return state._replace(value=energy.value_of(state.derivatives))
 
     def assemble(self, state: NewtonState, negative: float) -> None:
-        """See `NewtonModel`; contacts outside the system's pattern are added to its diagonal."""
+        """See `MapModel`; contacts outside the system's pattern are added to its diagonal."""
         super().assemble(state, negative)
         uncoupled, stiffness = self.energy.uncoupled, self.energy.stiffness
         if uncoupled.reach.size:
             self.system.add_blocks(*(stiffness * part[self.system.free] for part in uncoupled.blocks(state.w)))
 
     def check_numbers(self, state: NewtonState) -> None:
-        """See `NewtonModel`."""
+        """See `MapModel`."""
         if isinstance(self.surface, DeformationEnergy):
             self.surface.check_numbers(state.derivatives.surface)
 

@@ -26,8 +26,8 @@ from quasiharmonic.apps.tetrahedra.tetrahedral_maps import MovingTetrahedra, is_
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.measures import mean_ratio
 from quasiharmonic.energies.newton.line_search import backtrack
-from quasiharmonic.energies.newton.map_model import Coordinates, NewtonObjective, in_units, newton_descent, out_of_units
-from quasiharmonic.energies.newton.newton_descent import SHIFTS, NewtonDescent
+from quasiharmonic.energies.newton.map_model import Coordinates, NewtonObjective, in_units, out_of_units
+from quasiharmonic.energies.newton.newton_descent import SHIFTS, NewtonDescent, newton_descent
 from quasiharmonic.energies.newton.sliding_boundary import SlidingModel, SlidingSystem, move_boundary
 from quasiharmonic.energies.polishing import find_energy, scale_energy
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import QuadraticForm
 from quasiharmonic.energies.newton.line_search import Trial, backtrack, extend
-from quasiharmonic.energies.newton.newton_descent import NewtonDescent, NewtonState
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, to_complex, to_points
@@ -123,12 +122,34 @@ class Term(Protocol):
         """Add the second derivatives to an assembled system."""
 
 
+class NewtonState(NamedTuple):
+    """A map during a descent, as its model evaluated it.
+
+    Attributes
+    ----------
+    w : (n,) complex128
+        The map, in the model's unit.
+    derivatives : object
+        Derivatives of the map that the model computed.
+    value : float
+        The objective.
+    extra : object
+        Further state of the model, such as positions of sliding vertices.
+    """
+
+    w: ComplexArray
+    derivatives: Any
+    value: float
+    extra: Any = None
+
+
 class MapModel:
     """Minimise an energy plus terms; free vertices move along straight lines.
 
     The energy takes maps in the unit of ``coordinates``. The system has its triangles and the free vertices.
     """
 
+    #: Factor on the tolerance of a descent.
     slack = 1.0
 
     def __init__(
@@ -160,11 +181,11 @@ class MapModel:
         return value + sum(term.value(w) for term in self.terms) if self.terms else value
 
     def prepare(self, state: NewtonState) -> NewtonState:
-        """See `NewtonModel`."""
+        """Set up a step, and return the state with the objective of this step."""
         return state
 
     def gradient(self, state: NewtonState) -> ComplexArray:
-        """See `NewtonModel`."""
+        """Derivative of the objective by the unknowns."""
         free = self.system.free
         gradient = self.energy.gradient_of(state.derivatives, state.w.size)[free]
         for term in self.terms:
@@ -172,19 +193,19 @@ class MapModel:
         return gradient
 
     def assemble(self, state: NewtonState, negative: float) -> None:
-        """See `NewtonModel`."""
+        """Assemble the matrix of second derivatives; ``negative`` as in `Energy.curvature`."""
         self.system.assemble(self.energy.curvature_of(state.derivatives, negative=negative))
         for term in self.terms:
             term.add_to(self.system, state.w)
 
     def solve(self, load: ComplexArray) -> ComplexArray:
-        """See `NewtonModel`."""
+        """Displacement of the unknowns under a load, with the factored matrix."""
         return self.system.solve(load)
 
     def restrict(
         self, state: NewtonState, gradient: ComplexArray, direction: ComplexArray, expected_decrease: float
     ) -> tuple[ComplexArray, float]:
-        """See `NewtonModel`."""
+        """Return the allowed part of a direction and its expected decrease."""
         return direction, expected_decrease
 
     def displacement(self, direction: ComplexArray, n: int) -> ComplexArray:
@@ -196,7 +217,10 @@ class MapModel:
     def search(
         self, state: NewtonState, direction: ComplexArray, expected_decrease: float, shortened: bool
     ) -> tuple[NewtonState, bool] | None:
-        """See `NewtonModel`."""
+        """Line search: the next state and whether the step was shortened; None if no step lowers the objective.
+
+        ``expected_decrease`` is positive; ``shortened`` tells whether the previous step was shortened.
+        """
         full = self.displacement(direction, state.w.size)
 
         def trial(t: float, bound: float) -> tuple[float, NewtonState | None]:
@@ -231,19 +255,6 @@ class MapModel:
         return state.value, state if accepted else None
 
     def check_numbers(self, state: NewtonState) -> None:
-        """See `NewtonModel`."""
+        """Raise a ValueError if the energy or a derivative is NaN or infinite without extreme stretch."""
         if isinstance(self.energy, DeformationEnergy):
             self.energy.check_numbers(state.derivatives)
-
-
-def newton_descent(
-    energy: NewtonObjective, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str
-) -> tuple[NewtonDescent, MapModel]:
-    """Return a descent of an energy from an injective map (n, 2), and its model.
-
-    The energy takes maps in units of ``2 ** exponent``. The fixed vertices keep their positions in ``uv`` exactly.
-    """
-    model = MapModel(
-        energy, Coordinates.of(uv, fixed, exponent), NewtonSystem(energy.F, energy.g, len(uv), fixed, linear_solver)
-    )
-    return NewtonDescent(model, model.evaluate(in_units(uv, exponent))), model

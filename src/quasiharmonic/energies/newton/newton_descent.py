@@ -11,7 +11,7 @@ The second derivative of the energy is made positive definite triangle by triang
 (`quasiharmonic.energies.energies`). While collapsing triangles shorten the steps, negative eigenvalues are replaced by
 their absolute values, which allows longer steps. Afterwards they are clamped to zero, which converges faster.
 
-`NewtonDescent` decides how to step. What is minimised, and along which paths a map moves, is in a `NewtonModel`.
+`NewtonDescent` decides how to step. What is minimised, and along which paths a map moves, is in a `MapModel`.
 
 In an `IteratedDescent`, conjugate gradients replace some factorisations. Far from the minimum, the error of a map that
 was prolonged from a coarse mesh is mostly local. A few iterations without a factor remove it, in a tenth of the time of
@@ -24,14 +24,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
+from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, NewtonObjective, NewtonState, in_units
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.problem.result import Status
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, work
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, work
 
 # Relative increases of the diagonal, tried in turn until a factorisation exists. Rounding alone changes the eigenvalues
 # by about the first. They can be this small where triangle sizes span many orders of magnitude.
@@ -79,67 +80,6 @@ _ITERATION = IterationTuning()
 InverseNear = Callable[[FloatArray], Callable[[ComplexArray], ComplexArray]]
 
 
-class NewtonState(NamedTuple):
-    """A map during a descent, as its model evaluated it.
-
-    Attributes
-    ----------
-    w : (n,) complex128
-        The map, in the model's unit.
-    derivatives : object
-        Derivatives of the map that the model computed.
-    value : float
-        The objective.
-    extra : object
-        Further state of the model, such as positions of sliding vertices.
-    """
-
-    w: ComplexArray
-    derivatives: Any
-    value: float
-    extra: Any = None
-
-
-class NewtonModel(Protocol):
-    """What a `NewtonDescent` minimises, and along which paths a map moves."""
-
-    @property
-    def system(self) -> NewtonSystem:
-        """The linear system of the current step."""
-
-    @property
-    def slack(self) -> float:
-        """Factor on the tolerance."""
-
-    def prepare(self, state: NewtonState) -> NewtonState:
-        """Set up a step, and return the state with the objective of this step."""
-
-    def gradient(self, state: NewtonState) -> ComplexArray:
-        """Derivative of the objective by the unknowns."""
-
-    def assemble(self, state: NewtonState, negative: float) -> None:
-        """Assemble the matrix of second derivatives; ``negative`` as in `Energy.curvature`."""
-
-    def solve(self, load: ComplexArray) -> ComplexArray:
-        """Displacement of the unknowns under a load, with the factored matrix."""
-
-    def restrict(
-        self, state: NewtonState, gradient: ComplexArray, direction: ComplexArray, expected_decrease: float
-    ) -> tuple[ComplexArray, float]:
-        """Return the allowed part of a direction and its expected decrease."""
-
-    def search(
-        self, state: NewtonState, direction: ComplexArray, expected_decrease: float, shortened: bool
-    ) -> tuple[NewtonState, bool] | None:
-        """Line search: the next state and whether the step was shortened; None if no step lowers the objective.
-
-        ``expected_decrease`` is positive; ``shortened`` tells whether the previous step was shortened.
-        """
-
-    def check_numbers(self, state: NewtonState) -> None:
-        """Raise a ValueError if the energy or a derivative is NaN or infinite without extreme stretch."""
-
-
 @dataclass(frozen=True)
 class StepMemory:
     """Outcome of the last steps, for the choice of the next.
@@ -166,7 +106,7 @@ class NewtonDescent:
     steps.
     """
 
-    def __init__(self, model: NewtonModel, state: NewtonState) -> None:
+    def __init__(self, model: MapModel, state: NewtonState) -> None:
         self.model, self.state = model, state
         self.first = state.value
         self.memory = StepMemory()
@@ -181,7 +121,7 @@ class NewtonDescent:
         """The current objective."""
         return self.state.value
 
-    def restart(self, model: NewtonModel, state: NewtonState) -> None:
+    def restart(self, model: MapModel, state: NewtonState) -> None:
         """Continue with another model."""
         self.model, self.state, self.memory = model, state, StepMemory()
 
@@ -270,7 +210,7 @@ class IteratedDescent(NewtonDescent):
     """
 
     def __init__(
-        self, model: NewtonModel, state: NewtonState, *, iterate: bool, inverse_near: InverseNear | None = None
+        self, model: MapModel, state: NewtonState, *, iterate: bool, inverse_near: InverseNear | None = None
     ) -> None:
         super().__init__(model, state)
         self._inverse_near = inverse_near
@@ -343,3 +283,16 @@ class IteratedDescent(NewtonDescent):
     def _is_as_expected(self) -> bool:
         """Whether there is a factor, and the last step with it lowered the objective about as expected."""
         return self.state.value - self._goal <= _ITERATION.unexpected * self._expected
+
+
+def newton_descent(
+    energy: NewtonObjective, uv: FloatArray, fixed: IntArray, exponent: int, linear_solver: str
+) -> tuple[NewtonDescent, MapModel]:
+    """Return a descent of an energy from an injective map (n, 2), and its model.
+
+    The energy takes maps in units of ``2 ** exponent``. The fixed vertices keep their positions in ``uv`` exactly.
+    """
+    model = MapModel(
+        energy, Coordinates.of(uv, fixed, exponent), NewtonSystem(energy.F, energy.g, len(uv), fixed, linear_solver)
+    )
+    return NewtonDescent(model, model.evaluate(in_units(uv, exponent))), model

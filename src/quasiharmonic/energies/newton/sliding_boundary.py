@@ -27,15 +27,14 @@ import numpy as np
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import QuadraticForm, damp
 from quasiharmonic.energies.newton.line_search import Trial, backtrack, extend
-from quasiharmonic.energies.newton.map_model import FRACTION, HALVINGS, Coordinates, MapModel, in_units
-from quasiharmonic.energies.newton.newton_descent import NewtonState
+from quasiharmonic.energies.newton.map_model import FRACTION, HALVINGS, Coordinates, MapModel, NewtonState, in_units
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves, Track, sliding_curves
 from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.geometry.exact.certificate import inverted_triangles, is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.problem import Domain, Problem
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, names_of
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, reject
 
 # Weight of the barrier, as a share of the current energy.
 _WEIGHT = 1e-2
@@ -50,12 +49,9 @@ def move_boundary(slide: bool | BoundaryCurves, domain: Domain, uv: FloatArray) 
     Raise a ValueError as `BoundaryCurves.lay`, or if moving the boundary onto the curves inverts triangles.
     """
     track = sliding_curves(slide, domain.loops, uv).lay(domain.loops, uv)
-    inverted = inverted_triangles(domain.F, track.uv)
-    if inverted.size:
-        raise ValueError(
-            f"with the boundary moved onto its curves, {names_of('triangle', 'triangles', inverted)} inverted or "
-            "degenerate: find the map with the boundary on the curves (injective_map with slide, or qhm map --slide)"
-        )
+    remedy = "find the map with the boundary on the curves (injective_map with slide, or qhm map --slide)"
+    message = f"with the boundary moved onto its curves, {{}} inverted or degenerate: {remedy}"
+    reject(inverted_triangles(domain.F, track.uv), "triangle", "triangles", message)
     return track
 
 
@@ -149,7 +145,7 @@ class SlidingSystem(NewtonSystem):
 
 
 class SlidingModel(MapModel):
-    """The model of a Newton descent whose boundary vertices slide on curves; see `NewtonModel`.
+    """The model of a Newton descent whose boundary vertices slide on curves; see `MapModel`.
 
     Parameters
     ----------
@@ -221,7 +217,7 @@ class SlidingModel(MapModel):
         return state._replace(value=boundary.energy + self.weight * self.deviation_barrier.value(boundary.s))
 
     def gradient(self, state: NewtonState) -> ComplexArray:
-        """See `NewtonModel`; also sets the unknowns of the sliding vertices for this step."""
+        """See `MapModel`; also sets the unknowns of the sliding vertices for this step."""
         self._frame = self.frame(state)
         self.system.tangent = self._frame.tangent
         return self._frame.gradient
@@ -264,7 +260,7 @@ class SlidingModel(MapModel):
             np.add.at(total, number[number >= 0], value[number >= 0])
 
     def assemble(self, state: NewtonState, negative: float) -> None:
-        """See `NewtonModel`."""
+        """See `MapModel`."""
         system, frame = self.system, self._frame
         assert frame is not None
         system.curve_stiffness = damp(frame.forces, negative)
@@ -288,7 +284,7 @@ class SlidingModel(MapModel):
     def search(
         self, state: NewtonState, direction: ComplexArray, expected_decrease: float, shortened: bool
     ) -> tuple[NewtonState, bool] | None:
-        """See `NewtonModel`; maps of a step are projected to the curves."""
+        """See `MapModel`; maps of a step are projected to the curves."""
         at, vertices = self.system.at, self._track.vertices
         full = self.displacement(direction, state.w.size)
         full[vertices] = self.system.tangent * direction[at].real

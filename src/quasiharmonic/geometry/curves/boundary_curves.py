@@ -21,6 +21,7 @@ from quasiharmonic.util.arrays import (
     index_array,
     invert_indices,
     loop_arrays,
+    reject,
     to_complex,
     vertex_names,
 )
@@ -125,8 +126,7 @@ class BoundaryCurves:
         """Return a copy for a submesh with the given vertices, ascending."""
         known = np.concatenate([index_array("on", list(self.on)), self.fixed])
         absent = np.setdiff1d(known, used)
-        if absent.size:
-            raise ValueError(f"the boundary curves refer to {vertex_names(absent)}, but no triangle uses them")
+        reject(absent, "vertex", "vertices", "the boundary curves refer to {}, but no triangle uses them")
         on = {int(np.searchsorted(used, v)): k for v, k in self.on.items()}
         return self._copy_with(on, np.searchsorted(used, self.fixed))
 
@@ -201,8 +201,7 @@ class BoundaryCurves:
         check_range("on", assigned, len(uv))
         check_range("fixed", self.fixed, len(uv))
         inner = np.setdiff1d(assigned, boundary)
-        if inner.size:
-            raise ValueError(f"on assigns curves to interior {vertex_names(inner)}: only boundary vertices can slide")
+        reject(inner, "vertex", "vertices", "on assigns curves to interior {}: only boundary vertices can slide")
         only = np.array([self.on.get(int(v), -1) for v in boundary])
         allowed = self.tolerance * max(one.size for one in self.curves)
         curve, s, smallest = np.full(boundary.size, -1), np.zeros(boundary.size), np.full(boundary.size, np.inf)

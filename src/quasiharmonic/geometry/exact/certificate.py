@@ -51,7 +51,7 @@ from quasiharmonic.util.arrays import (
     make_unchangeable,
     vertex_names,
 )
-from quasiharmonic.util.outcome import Displayable, Verdict
+from quasiharmonic.util.outcome import Displayable, Verdict, as_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -178,15 +178,10 @@ class Certificate(ReadOnly, Displayable, Verdict):
         """Return the certificate in plain Python types, fit for JSON; each loop as its first vertex and its length."""
         return {
             **super().to_dict(),
-            "injective": self.injective,
-            "triangles": self.triangles,
-            "inverted": self.inverted.tolist(),
-            "degenerate": self.degenerate.tolist(),
-            "nonfinite": self.nonfinite.tolist(),
+            **as_plain(self, "injective", "triangles", "inverted", "degenerate", "nonfinite"),
             "reasons": [{"kind": r.kind.value, "text": r.text, "loops": list(r.loops)} for r in self.reasons],
             "loops": [{"start": int(loop[0]), "length": len(loop)} for loop in self.loops],
-            "crossings": self.crossings.tolist(),
-            "multiply_wound": self.multiply_wound.tolist(),
+            **as_plain(self, "crossings", "multiply_wound"),
             "summary": self.summary(),
         }
 
@@ -293,28 +288,3 @@ def _find_loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
 
 def _edge_names(pairs: IntArray) -> list[str]:
     return [f"{i}–{j}" for i, j in pairs.tolist()]
-
-
-def certify_each(
-    F: Sequence[IntArray], uv: Sequence[FloatArray], loops: Sequence[Sequence[IntArray]]
-) -> list[Certificate]:
-    """Certify maps exactly; each result equals that of `certify`.
-
-    The loops are those of `boundary_loops`, not checked.
-    """
-    if not F:
-        return []
-    vertices = np.cumsum([0, *map(len, uv)])
-    triangles = np.cumsum([0, *map(len, F)])
-    positions = np.concatenate(uv)
-    good = np.array([len(rims) == 1 for rims in loops]) & (np.diff(triangles) > 0)
-    bad = inverted_triangles(np.concatenate([T + first for T, first in zip(F, vertices[:-1], strict=True)]), positions)
-    good[np.searchsorted(triangles, bad, side="right") - 1] = False
-    candidates = np.flatnonzero(good)
-    if candidates.size:
-        rims = [loops[k][0] + vertices[k] for k in candidates.tolist()]
-        good[candidates] = simple_loops(rims, positions)
-    return [
-        Certificate(F[k], uv[k], True, loops=tuple(loops[k])) if good[k] else certify(F[k], uv[k], loops=loops[k])
-        for k in range(len(F))
-    ]

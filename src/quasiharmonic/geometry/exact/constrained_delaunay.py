@@ -25,7 +25,7 @@ import numpy as np
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.polygons import triangulate
-from quasiharmonic.geometry.mesh.topology import edge_keys, edges, label_components, pair_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges, find_pairs, label_components, pair_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, cyclic_pairs, mark, to_integers
 
 
@@ -108,14 +108,12 @@ def select_inside(F: IntArray, rim: IntArray, n: int) -> BoolArray:
 
     ``rim`` (m, 2) has the edges as pairs of ``n`` points. Triangles are joined across all other edges.
     """
-    tails, heads, owner = F.ravel(), np.roll(F, -1, axis=1).ravel(), np.arange(F.size) // 3
-    keys = edge_keys(tails, heads, n)
-    open_ = np.flatnonzero(~np.isin(keys, pair_keys(rim, n)))
-    order = open_[np.argsort(keys[open_], kind="stable")]
-    pair = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
-    part = label_components(owner[order[pair]], owner[order[pair + 1]], len(F))
-    forward = np.isin(tails * n + heads, rim[:, 0] * n + rim[:, 1])
-    return mark(len(F), part[owner[forward]])[part]
+    tails, heads = F.ravel(), np.roll(F, -1, axis=1).ravel()
+    one, other = find_pairs(F)
+    is_open = ~np.isin(edge_keys(tails[one], heads[one], n), pair_keys(rim, n))
+    part = label_components(one[is_open] // 3, other[is_open] // 3, len(F))
+    forward = np.flatnonzero(np.isin(tails * n + heads, rim[:, 0] * n + rim[:, 1]))
+    return mark(len(F), part[forward // 3])[part]
 
 
 def delaunay_by_qhull(points: FloatArray) -> IntArray:

@@ -25,6 +25,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     SignArray,
     enumerate_each,
+    enumerate_ranges,
     morton_order,
     repeat_each,
 )
@@ -231,16 +232,9 @@ def _cross_rays(
     low, high = np.minimum(tails, heads), np.maximum(tails, heads)
     by_level = np.argsort(points[:, 1], kind="stable")
     level = points[by_level, 1]
-    first = np.searchsorted(level, low[:, 1], side="left")
-    count = np.searchsorted(level, high[:, 1], side="right") - first
-    until = np.cumsum(count)
-    begin = 0
-    while begin < len(tails):
-        done = until[begin - 1] if begin else 0
-        end = max(int(np.searchsorted(until, done + PAIR_CHUNK, side="right")), begin + 1)
-        edge = repeat_each(np.arange(begin, end), count[begin:end])
-        point = by_level[first[edge] + np.arange(edge.size) - (until[edge] - count[edge] - done)]
-        begin = end
+    first, last = np.searchsorted(level, low[:, 1]), np.searchsorted(level, high[:, 1], side="right")
+    for edge, nth in enumerate_ranges(first, last, PAIR_CHUNK):
+        point = by_level[nth]
         ahead = high[edge, 0] >= points[point, 0]
         edge, point = edge[ahead], point[ahead]
         here, tail, head = points[point], tails[edge], heads[edge]

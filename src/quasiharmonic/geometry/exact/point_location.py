@@ -17,7 +17,6 @@ recursively. So the lists are short even if the sizes of triangles differ by man
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,7 +24,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.predicates import orientation, twice_area
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, enumerate_each, invert_indices, mark, repeat_each
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    enumerate_each,
+    enumerate_ranges,
+    invert_indices,
+    mark,
+    repeat_each,
+)
 from quasiharmonic.util.kernels import compiled
 
 
@@ -101,7 +109,7 @@ class PointLocator:
     def _decide(self, points: FloatArray, begin: IntArray, end: IntArray) -> IntArray:
         """Compute the result of `find` for points that floating point cannot decide."""
         found = np.full(len(points), -1, dtype=np.int64)
-        for point, entry in _pairs(begin, end):
+        for point, entry in enumerate_ranges(begin, end, _TUNING.pairs):
             triangle = self._grid.listed[entry].astype(np.int64)
             # Candidates of a point ascend. Writing them backwards leaves the smallest.
             hits = np.flatnonzero(self._contain(points, point, triangle))[::-1]
@@ -133,18 +141,6 @@ class PointLocator:
         return (area / area.sum(axis=0)).T
 
 
-def _pairs(begin: IntArray, end: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield portions of the pairs of a point and an entry of its list, sorted by point, then entry."""
-    count = end - begin
-    total = np.cumsum(count)
-    start = done = 0
-    while start < begin.size:
-        stop = max(int(np.searchsorted(total, done + _TUNING.pairs, side="right")), start + 1)
-        point = repeat_each(np.arange(start, stop), count[start:stop])
-        yield point, np.arange(done, int(total[stop - 1])) + (end - total)[point]
-        start, done = stop, int(total[stop - 1])
-
-
 @compiled
 def sure_hits(
     points: FloatArray, begin: IntArray, end: IntArray, listed: NDArray[np.int32], rows: FloatArray, hits: IntArray
@@ -154,7 +150,7 @@ def sure_hits(
     Fill in -2 if this is not sure, and -1 if the point is surely outside all candidates. rows: corners (f, 6).
     """
     hits[:] = -1
-    for point, entry in _pairs(begin, end):
+    for point, entry in enumerate_ranges(begin, end, _TUNING.pairs):
         triangle = listed[entry]
         lowest = _lowest_determinants(points[point], rows.take(triangle, axis=0))
         possible = np.flatnonzero(lowest >= -_TUNING.unsure)[::-1]

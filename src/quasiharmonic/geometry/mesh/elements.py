@@ -27,7 +27,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.topology import edges
+from quasiharmonic.geometry.mesh.topology import edges, find_sides
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
@@ -35,6 +35,7 @@ from quasiharmonic.util.arrays import (
     edge_names,
     index_array,
     names_of,
+    reject,
     triangle_names,
 )
 
@@ -90,13 +91,13 @@ def _check_middles(F: IntArray) -> None:
     ends = np.sort(F[:, SIDES].reshape(-1, 2), axis=1)
     middle, first, number = np.unique(F[:, MIDDLES], return_index=True, return_inverse=True)
     differs = (ends != ends[first][number.ravel()]).any(axis=1)
-    if differs.any():
-        raise ValueError(
-            f"{names_of('node', 'nodes', middle[np.unique(number.ravel()[differs])])} between different "
-            f"corners in one triangle "
-            "than in another: a row of F needs the three corners, then the nodes between the first and the second, "
-            "the second and the third, the third and the first"
-        )
+    reject(
+        middle[np.unique(number.ravel()[differs])],
+        "node",
+        "nodes",
+        "{} between different corners in one triangle than in another: a row of F needs the three corners, then the "
+        "nodes between the first and the second, the second and the third, the third and the first",
+    )
 
 
 def check_spread(F: IntArray, n: int) -> None:
@@ -190,9 +191,8 @@ def corner_triangles(F: IntArray) -> tuple[IntArray, IntArray]:
 def rim(F: IntArray) -> IntArray:
     """Ascending nodes on sides that belong to one element only; the orientation of elements does not matter."""
     triangles, _ = covering_triangles(F)
-    pairs = np.sort(triangles[:, SIDES].reshape(-1, 2), axis=1)
-    found, count = np.unique(pairs, axis=0, return_counts=True)
-    return np.unique(found[count == 1])
+    pairs, side = find_sides(triangles, int(triangles.max(initial=-1)) + 1)
+    return np.unique(pairs[np.bincount(side.ravel()) == 1])
 
 
 def reverse_elements(F: IntArray) -> IntArray:

@@ -21,7 +21,7 @@ from quasiharmonic.util.arrays import (
     ComplexArray,
     FloatArray,
     IntArray,
-    names_of,
+    reject,
     repeat_each,
     scale_to_unit,
 )
@@ -131,17 +131,13 @@ def triangulate_polygons(V: FloatArray, vertices: IntArray, starts: IntArray) ->
 
 
 def _check_rings(vertices: IntArray, sizes: IntArray) -> None:
-    small = np.flatnonzero(sizes < 3)
-    if small.size:
-        raise ValueError(f"{names_of('face', 'faces', small)} of fewer than three corners: remove them")
+    reject(sizes < 3, "face", "faces", "{} of fewer than three corners: remove them")
     face = repeat_each(np.arange(len(sizes)), np.where(sizes > 3, sizes, 0))
     vertices = vertices[repeat_each(sizes > 3, sizes)]
     order = np.lexsort((vertices, face))
     same = (np.diff(face[order]) == 0) & (np.diff(vertices[order]) == 0)
-    if same.any():
-        raise ValueError(
-            f"{names_of('face', 'faces', np.unique(face[order][1:][same]))} with a vertex twice: remove the repetition"
-        )
+    twice = np.unique(face[order][1:][same])
+    reject(twice, "face", "faces", "{} with a vertex twice: remove the repetition")
 
 
 def _triangulate_by_ears(points: FloatArray, rings: IntArray) -> IntArray:
@@ -239,27 +235,25 @@ def triangulate(corners: list[Point]) -> list[Triangle]:
     return sweep.triangles
 
 
+@dataclass(slots=True, eq=False)
 class _Link:
     """Element of a chain. When a chain is split, its rightmost corner gets two elements."""
 
-    __slots__ = ("above", "below", "corner")
-
-    def __init__(self, corner: int) -> None:
-        self.corner = corner
-        self.below: _Link | None = None
-        self.above: _Link | None = None
+    corner: int
+    below: _Link | None = None
+    above: _Link | None = None
 
 
+@dataclass(slots=True, eq=False)
 class _Interval:
     """Interval of the sweep line between two sides of the polygon."""
 
-    __slots__ = ("bottom", "last", "side", "top")
-
-    def __init__(self, side: tuple[int, int], bottom: _Link, last: _Link, top: _Link) -> None:
-        # The side of the polygon below, from left to right.
-        self.side = side
-        # The ends of the chain, and its rightmost corner, the one that came last.
-        self.bottom, self.last, self.top = bottom, last, top
+    # The side of the polygon below, from left to right.
+    side: tuple[int, int]
+    # The ends of the chain, and its rightmost corner, the one that came last.
+    bottom: _Link
+    last: _Link
+    top: _Link
 
 
 class _Sweep:

@@ -35,7 +35,7 @@ from quasiharmonic.util.arrays import (
     find_exponent,
     own_triangles,
     pad_to_space,
-    triangle_names,
+    reject,
     vertex_array,
 )
 from quasiharmonic.util.kernels import compiled
@@ -265,12 +265,8 @@ class RestShapes:
 
     def check_areas(self, reason: str) -> None:
         """Raise a ValueError with the triangles of zero area and the reason why areas are needed, if there are any."""
-        flat = self.flat
-        if flat.size:
-            raise ValueError(
-                f"{triangle_names(flat)} of zero area in the rest mesh: {reason}; remove them with "
-                "clean, or use unwrap, which excludes them"
-            )
+        remedy = "remove them with clean, or use unwrap, which excludes them"
+        reject(self.flat, "triangle", "triangles", f"{{}} of zero area in the rest mesh: {reason}; {remedy}")
 
     def half_gradients(self) -> ComplexArray:
         """Half the gradients ``γᵢ/2`` of the hat functions (3, f) in inverse units; NaN for triangles without area.

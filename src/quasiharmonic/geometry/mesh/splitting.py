@@ -34,11 +34,10 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_range,
     edge_array,
-    edge_names,
     first_equal,
     mark,
+    reject,
     scale_to_unit,
-    triangle_names,
     triangle_rows,
     vertex_array,
 )
@@ -138,9 +137,7 @@ def open_along(F: IntArray, cut: IntArray, n: int) -> FanCorners:
     without a common edge are split, too. Raises a ValueError that names the first cuts that are not edges of the mesh.
     """
     check_range("edges", cut, n)
-    unknown = ~are_sides(cut, F, n)
-    if unknown.any():
-        raise ValueError(f"{edge_names(cut[unknown])}: not an edge of the mesh")
+    reject(cut[~are_sides(cut, F, n)], "edge", "edges", "{}: not an edge of the mesh")
     return FanCorners(*number_fans(F, fans(F, mark_sides(F, cut, n))[0], n))
 
 
@@ -206,12 +203,9 @@ def weld_triangles(V: FloatArray, F: IntArray, weld: bool | float) -> tuple[IntA
     ValueError if welding merges corners of a triangle; the message names the triangles.
     """
     joint = find_representatives(V, F, weld)
-    collapsed = np.flatnonzero(are_collapsed(joint[F]) & ~are_collapsed(F))
-    if collapsed.size:
-        raise ValueError(
-            f"welding at distance {float(weld):g} merges corners of {triangle_names(collapsed)}: "
-            "choose a smaller distance, or remove these triangles"
-        )
+    remedy = "choose a smaller distance, or remove these triangles"
+    message = f"welding at distance {float(weld):g} merges corners of {{}}: {remedy}"
+    reject(are_collapsed(joint[F]) & ~are_collapsed(F), "triangle", "triangles", message)
     return joint[F], joint
 
 
@@ -393,5 +387,4 @@ def _length(V: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
 def _check_known(wanted: IntArray, known: IntArray, n: int, reason: str) -> None:
     inside = ((wanted >= 0) & (wanted < n)).all(axis=1)
     bad = wanted[~(inside & np.isin(pair_keys(wanted, n), known))]
-    if len(bad):
-        raise ValueError(f"cannot split {edge_names(bad)}: {reason}")
+    reject(bad, "edge", "edges", f"cannot split {{}}: {reason}")

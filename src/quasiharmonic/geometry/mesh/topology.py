@@ -8,7 +8,6 @@ Checks of whether triangles form a valid surface name the offending elements.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -19,13 +18,11 @@ from quasiharmonic.util.arrays import (
     BoolArray,
     IntArray,
     check_range,
-    edge_names,
     first_equal,
     make_unchangeable,
     mark,
     own_triangles,
-    repeat_each,
-    triangle_names,
+    reject,
     vertex_names,
 )
 from quasiharmonic.util.kernels import compiled
@@ -69,28 +66,25 @@ def edges(F: NDArray[np.integer], n: int) -> Edges:
 @compiled
 def sort_edges(F: IntArray, n: int, pairs: IntArray, sizes: IntArray) -> int:
     """Fill in the edges, kind after kind as in `Edges`, and their numbers; return 0 if F is out of range, else 1."""
-    # Number of half-edges from which the sparse matrix is faster than a sort.
-    sparse_from = 10_000
     if F.size and (F.min() < 0 or F.max() >= n):
         return 0
-    T = np.ascontiguousarray(F.T, dtype=np.int32)
-    tail, head = T.ravel(), T[(1, 2, 0), :].ravel()
-    # SciPy halves the time for large meshes, but importing it for this alone takes longer.
-    sort = _sort_by_rows if tail.size >= sparse_from and "scipy.sparse" in sys.modules else _sort_by_keys
-    low, high, direction = sort(tail, head, n)
-    del T, tail, head
-    starts = np.ones(low.size, dtype=bool)
-    np.not_equal(high[1:], high[:-1], out=starts[1:])
-    starts[1:] |= low[1:] != low[:-1]
-    first = np.flatnonzero(starts)
-    count = np.diff(first, append=low.size)
+    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
+    # Sort half-edges by edge, those that start at the smaller end first.
+    key = edge_keys(tail, head, n)
+    key *= 2
+    key += tail > head
+    key.sort()
+    direction = (key & 1).astype(bool)
+    key >>= 1
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    count = np.diff(first, append=key.size)
     pair, single = first[count == 2], first[count == 1]
     opposed = direction[pair] != direction[pair + 1]
     filled = 0
     for kind, start in enumerate((pair[opposed], single, pair[~opposed], first[count > 2])):
         sizes[kind] = start.size
         some = pairs[filled : filled + start.size]
-        some[:, 0], some[:, 1] = low[start], high[start]
+        some[:, 0], some[:, 1] = np.divmod(key[start], max(n, 1))
         if kind == 1:
             flip = direction[single]
             some[flip] = some[flip, ::-1]
@@ -142,34 +136,6 @@ def pair_sides(side: IntArray) -> tuple[IntArray, IntArray]:
     other[first[two]] = last[two]
     one = np.flatnonzero(other >= 0)
     return one, other[one]
-
-
-_Integers = NDArray[np.integer]
-
-
-def _sort_by_keys(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[_Integers, _Integers, BoolArray]:
-    """Sort half-edges by edge: smaller end, larger end, and whether the half-edge starts at the larger end."""
-    key = edge_keys(tail, head, n)
-    key *= 2
-    key += tail > head
-    key.sort()
-    direction = (key & 1).astype(bool)
-    low, high = np.divmod(np.right_shift(key, 1, out=key), max(n, 1))
-    return low, high, direction
-
-
-def _sort_by_rows(tail: NDArray[np.int32], head: NDArray[np.int32], n: int) -> tuple[_Integers, _Integers, BoolArray]:
-    """As `_sort_by_keys`, by a sparse matrix; half-edges of the same edge may come in another order."""
-    from scipy.sparse import csr_array
-
-    table = (tail > head, np.minimum(tail, head), np.arange(tail.size + 1))
-    # Converting the matrix of half-edges and smaller ends to columns sorts the half-edges by their smaller ends.
-    turned = csr_array(table, shape=(tail.size, n)).tocsc()
-    del table
-    by_low = csr_array((turned.data, np.maximum(tail, head).take(turned.indices), turned.indptr), shape=(n, n))
-    by_low.sort_indices()
-    low: _Integers = repeat_each(np.arange(n, dtype=by_low.indices.dtype), np.diff(by_low.indptr))
-    return low, by_low.indices, by_low.data
 
 
 def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> IntArray:
@@ -264,11 +230,8 @@ def trace_loops(boundary: IntArray) -> list[IntArray]:
     if number < 0:
         tails, heads = np.sort(boundary, axis=0).T
         shared = np.unique(tails[1:][tails[1:] == tails[:-1]])
-        if shared.size:
-            raise ValueError(
-                f"the boundary passes more than once through {vertex_names(shared)}; "
-                "inspect_mesh (qhm check) lists defects, and vertices at equal positions that may need to be merged"
-            )
+        remedy = "inspect_mesh (qhm check) lists defects, and vertices at equal positions that may need to be merged"
+        reject(shared, "vertex", "vertices", f"the boundary passes more than once through {{}}; {remedy}")
         unpaired = np.setxor1d(tails, heads)
         raise ValueError(
             f"the boundary does not close at {vertex_names(unpaired)}; orient all triangles alike with clean"
@@ -364,9 +327,7 @@ def surface_edges(F: IntArray, n: int) -> Edges:
     connected = not label.any()
     if not connected:
         # A vertex without triangle is a component of its own.
-        unused = np.setdiff1d(np.arange(n), F)
-        if unused.size:
-            raise ValueError(f"{vertex_names(unused)}: no triangle uses them; remove them")
+        reject(np.setdiff1d(np.arange(n), F), "vertex", "vertices", "{}: no triangle uses them; remove them")
     found = manifold_edges(F, n)
     if not found.boundary.size:
         raise ValueError(
@@ -391,28 +352,15 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
     # An edge from a vertex to itself is never interior, so only the other kinds of edges need a test.
     if found.nonmanifold.size or found.inconsistent.size or np.any(found.boundary[:, 0] == found.boundary[:, 1]):
         _check_triangles(F)
-    if found.nonmanifold.size:
-        raise ValueError(
-            f"{edge_names(found.nonmanifold)} in more than two triangles: not a surface; cut it open with clean, or "
-            "use unwrap, which does so"
-        )
-    if found.inconsistent.size:
-        raise ValueError(
-            f"mixed winding: {edge_names(found.inconsistent)} traversed in the same direction by both triangles; "
-            "orient all triangles alike with clean, or use unwrap, which does so"
-        )
+    crowded = "{} in more than two triangles: not a surface; cut it open with clean, or use unwrap, which does so"
+    reject(found.nonmanifold, "edge", "edges", crowded)
+    mixed = "mixed winding: {} traversed in the same direction by both triangles; orient all triangles alike with clean"
+    reject(found.inconsistent, "edge", "edges", f"{mixed}, or use unwrap, which does so")
     return found
 
 
 def _check_triangles(F: IntArray) -> None:
-    collapsed = np.flatnonzero(are_collapsed(F))
-    if collapsed.size:
-        raise ValueError(
-            f"{triangle_names(collapsed)}: a vertex is used twice in a triangle; remove such triangles with clean"
-        )
-
-    repeats = np.flatnonzero(find_twins(F) < np.arange(len(F)))
-    if repeats.size:
-        raise ValueError(
-            f"{triangle_names(repeats)} repeated: the same three vertices occur before; remove repetitions with clean"
-        )
+    message = "{}: a vertex is used twice in a triangle; remove such triangles with clean"
+    reject(are_collapsed(F), "triangle", "triangles", message)
+    message = "{} repeated: the same three vertices occur before; remove repetitions with clean"
+    reject(find_twins(F) < np.arange(len(F)), "triangle", "triangles", message)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quasiharmonic.util.arrays import IntArray, ReadOnly, count_of
-from quasiharmonic.util.outcome import Displayable
+from quasiharmonic.util.outcome import Displayable, as_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -152,9 +152,7 @@ class Obstruction(ReadOnly):
         return {
             "kind": self.kind.name.lower(),
             "forbids": self.forbids.name.lower(),
-            "message": self.message,
-            "advice": self.advice,
-            **{name: getattr(self, name).tolist() for name in _ELEMENTS},
+            **as_plain(self, "message", "advice", *_ELEMENTS),
         }
 
 
@@ -257,13 +255,7 @@ class Diagnosis(Displayable):
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON: the forbidden classes, every obstruction, the edges to split."""
-        return {
-            "forbids_injective": self.forbids_injective,
-            "forbids_bijective": self.forbids_bijective,
-            "obstructions": [o.to_dict() for o in self.obstructions],
-            "split": self.split.tolist(),
-            "unchecked": list(self.unchecked),
-        }
+        return as_plain(self, "forbids_injective", "forbids_bijective", "obstructions", "split", "unchecked")
 
 
 def smallest_conflict(count: int, possible: Callable[[list[int]], bool]) -> list[int]:

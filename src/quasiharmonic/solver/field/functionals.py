@@ -34,11 +34,11 @@ from typing import Protocol
 import numpy as np
 
 from quasiharmonic.geometry.mesh.reference import Derivatives, ReferenceMesh
-from quasiharmonic.geometry.mesh.topology import edge_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, pair_keys
 from quasiharmonic.linsolve.laplacian import FactoredLaplacian, Laplacian
 from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.tensor import TensorField
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, work
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, work
 
 
 class Functional(ABC):
@@ -140,6 +140,7 @@ class DualFunctional(Functional):
     def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
         super().__init__(problem, mesh)
         self._cached: tuple[TensorField, ComplexArray] | None = None
+        self._one_fixed: Laplacian | None = None
 
     def response(self, at: QuasiHarmonicMap) -> ComplexArray:
         """Return ``L† g`` up to a constant, computed once for a tensor field."""
@@ -153,6 +154,14 @@ class DualFunctional(Functional):
     def _respond(self, at: QuasiHarmonicMap) -> ComplexArray:
         """Compute `response`."""
 
+    def _solve(
+        self, at: QuasiHarmonicMap, F: IntArray, first: IntArray, stiffness: FloatArray, load: ComplexArray
+    ) -> ComplexArray:
+        """Solve on triangles F (f, 3), always the same, with their ``first`` unknown (1,) fixed."""
+        if self._one_fixed is None:
+            self._one_fixed = Laplacian(F, load.size, first, at.operator.laplacian.solver.name)
+        return self._one_fixed.factor(stiffness).respond(load)
+
 
 class Poisson(DualFunctional):
     """V₄, the Poisson functional (eq. 29, 44), dual to V₃.
@@ -162,15 +171,12 @@ class Poisson(DualFunctional):
     """
 
     name = "poisson"
-    _one_fixed: Laplacian | None = None
 
     def _respond(self, at: QuasiHarmonicMap) -> ComplexArray:
         """Compute the map with the target's Neumann data; (n,) complex128."""
-        if self._one_fixed is None:
-            first, solver = self.problem.fixed[:1], at.operator.laplacian.solver.name
-            self._one_fixed = Laplacian(self.problem.F, self.problem.n, first, solver)
-        factored = self._one_fixed.factor(self.mesh.edge_stiffness(at.field.entries()))
-        return factored.respond(neumann_target(self.problem, at.w))
+        stiffness = self.mesh.edge_stiffness(at.field.entries())
+        load = neumann_target(self.problem, at.w)
+        return self._solve(at, self.problem.F, self.problem.fixed[:1], stiffness, load)
 
     def value(self, at: QuasiHarmonicMap) -> float:
         return 0.5 * work(neumann_target(self.problem, at.w), self.response(at) - at.w)
@@ -191,17 +197,15 @@ class EdgePoisson(DualFunctional):
     """
 
     name = "edge-poisson"
-    _one_fixed: Laplacian | None = None
 
     def __init__(self, problem: Problem, mesh: ReferenceMesh) -> None:
         super().__init__(problem, mesh)
         F, n = problem.F, problem.n
-        opposite = edge_keys(F[:, (1, 2, 0)], F[:, (2, 0, 1)], n)
-        keys, number = np.unique(opposite, return_inverse=True)
+        ends, side = find_sides(F, n)
         #: Edge opposite to each corner, (f, 3).
-        self._edges = number.reshape(-1, 3)
+        self._edges = side[:, (1, 2, 0)]
         self._tail, self._head = problem.domain.edges.boundary.T
-        self._boundary_edges = np.searchsorted(keys, edge_keys(self._tail, self._head, n))
+        self._boundary_edges = np.searchsorted(pair_keys(ends, n), edge_keys(self._tail, self._head, n))
         # The same triangles with separate corners.
         self._separate_mesh = copy(mesh)
         self._separate_mesh.F = np.arange(F.size).reshape(-1, 3)
@@ -209,15 +213,11 @@ class EdgePoisson(DualFunctional):
 
     def _respond(self, at: QuasiHarmonicMap) -> ComplexArray:
         """Compute the solution at the midpoints of edges; (e,) complex128, edges sorted by their ends."""
-        size = int(self._edges.max()) + 1
-        if self._one_fixed is None:
-            solver = at.operator.laplacian.solver.name
-            self._one_fixed = Laplacian(self._edges, size, self._boundary_edges[:1], solver)
         # The basis function of an edge has −2 times the gradient of the opposite corner's hat function.
-        factored = self._one_fixed.factor(4 * self.mesh.edge_stiffness(at.field.entries()))
-        load = np.zeros(size, dtype=np.complex128)
+        stiffness = 4 * self.mesh.edge_stiffness(at.field.entries())
+        load = np.zeros(int(self._edges.max()) + 1, dtype=np.complex128)
         load[self._boundary_edges] = self._neumann_target(at.w)
-        return factored.respond(load)
+        return self._solve(at, self._edges, self._boundary_edges[:1], stiffness, load)
 
     def value(self, at: QuasiHarmonicMap) -> float:
         middle = 0.5 * (at.w[self._tail] + at.w[self._head])

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, names_of
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, reject
 
 # Replaces a divisor of zero whose dividend is zero too, to avoid NaN.
 _TINY = 1e-300
@@ -151,9 +151,7 @@ def beltrami_coefficients(mu: ArrayLike | None, f: int) -> ComplexArray:
     coefficients = np.zeros(f) if mu is None else np.asarray(mu)
     if coefficients.shape != (f,) or coefficients.dtype.kind not in "iufc":
         raise ValueError(f"mu must contain {f} numbers, one for each triangle, not an array of {coefficients.shape}")
-    bad = np.flatnonzero(~(np.abs(coefficients) < 1))
-    if bad.size:
-        raise ValueError(f"mu is not below 1 in modulus at {names_of('triangle', 'triangles', bad)}")
+    reject(~(np.abs(coefficients) < 1), "triangle", "triangles", "mu is not below 1 in modulus at {}")
     return coefficients.astype(np.complex128)
 
 

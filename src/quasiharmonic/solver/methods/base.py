@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeAlias, get_args
+from typing import ClassVar, Protocol, TypeAlias
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from quasiharmonic.problem.result import Status
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
-from quasiharmonic.util.arrays import ComplexArray, check_choice, check_integer
+from quasiharmonic.util.arrays import ComplexArray, check_choice
+from quasiharmonic.util.options import Options, option, positive, reference_name
 
 Iterates: TypeAlias = Generator[Iterate, None, bool]
 
@@ -81,7 +82,7 @@ class SearchStage(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Descent(SearchStage):
+class Descent(SearchStage, Options):
     """One stage of a search, on the mesh itself.
 
     Attributes
@@ -211,15 +212,10 @@ class TensorDescent(Descent):
         be an early one that is far from any solution.)
     """
 
-    parameterisation: str = "tanh"
-    reference: Reference = "equilateral"
-    iterations: int = 1000
+    parameterisation: str = option("tanh", check=lambda name, value: check_choice(name, value, PARAMETERISATIONS))
+    reference: Reference = option("equilateral", check=reference_name)
+    iterations: int = option(1000, check=positive)
     patience: ClassVar[tuple[int, float] | None] = (300, 1e-3)
-
-    def __post_init__(self) -> None:
-        check_choice("parameterisation", self.parameterisation, PARAMETERISATIONS)
-        check_choice("reference", self.reference, get_args(Reference))
-        check_integer("iterations", self.iterations, minimum=1)
 
     @property
     def name(self) -> str:
@@ -254,11 +250,7 @@ class FunctionalDescent(TensorDescent):
         A name of `quasiharmonic.solver.field.functionals.FUNCTIONALS`: the functional to descend (§7.3).
     """
 
-    functional: str = "dirichlet"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice("functional", self.functional, FUNCTIONALS)
+    functional: str = option("dirichlet", check=lambda name, value: check_choice(name, value, FUNCTIONALS))
 
     @property
     def name(self) -> str:

@@ -13,7 +13,7 @@ The method requires a single boundary loop with a simple image.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import islice
 from typing import ClassVar
 
@@ -25,7 +25,8 @@ from quasiharmonic.geometry.exact.point_location import PointLocator
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates
 from quasiharmonic.solver.methods.vector_adam import VectorAdam
-from quasiharmonic.util.arrays import ComplexArray, IntArray, check_integer, to_points
+from quasiharmonic.util.arrays import ComplexArray, IntArray, to_points
+from quasiharmonic.util.options import count, option
 
 # Corners of the disk are spread half by the target's arc length and half evenly, so that none are too close.
 _EVEN_SHARE = 0.5
@@ -44,15 +45,11 @@ class Composite(VectorAdam):
         steps.
     """
 
-    direct: int = 6
+    direct: int = option(6, check=count)
 
     label: ClassVar[str] = "composite"
     #: Short: close to a solution it is found soon; the rest is for local repair.
     patience: ClassVar[tuple[int, float] | None] = (10, 0.5)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_integer("direct", self.direct, minimum=0)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; without a composite all steps are those of `VectorAdam`."""
@@ -65,14 +62,8 @@ class Composite(VectorAdam):
             return bool((yield from steps))
         there = objective.near_map(w)
         yield there
-        nearby = VectorAdam(
-            functional=self.functional,
-            parameterisation=self.parameterisation,
-            iterations=left,
-            schedule=self.schedule or NEARBY_STEPS,
-            momenta=self.momenta,
-            relocation=self.relocation,
-        )
+        shared = {one.name: getattr(self, one.name) for one in fields(VectorAdam)}
+        nearby = VectorAdam(**shared | {"iterations": left, "schedule": self.schedule or NEARBY_STEPS})
         return (yield from nearby.iterates(objective, there))
 
 

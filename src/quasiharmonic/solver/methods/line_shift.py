@@ -27,7 +27,8 @@ from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
 from quasiharmonic.solver.methods.local_repair import Patch, RepairEffort, patch_around, remap_patches
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer, invert_indices
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, invert_indices
+from quasiharmonic.util.options import option, positive
 from quasiharmonic.util.progress import heartbeat
 
 Generator = np.random.Generator
@@ -72,13 +73,10 @@ class LineShift(VertexDescent):
         Maximum number of consecutive programmes that untangle no triangle.
     """
 
-    max_failures: int = 5
+    max_failures: int = option(5, check=positive)
 
     label: ClassVar[str] = "line shift"
     quick: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_integer("max_failures", self.max_failures, minimum=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; yields a map after every programme that reduces the number of inverted triangles."""

@@ -20,7 +20,8 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
 from quasiharmonic.solver.methods.untangling import untangle
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, check_integer, mark
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
+from quasiharmonic.util.options import option, positive
 
 # Maximum number of inverted triangles for which local repair begins.
 MAX_INVERTED = 50
@@ -116,13 +117,10 @@ class LocalRepair(VertexDescent):
         Maximum number of patches; failed ones yield nothing.
     """
 
-    tries: int = 30
+    tries: int = option(30, check=positive)
 
     label: ClassVar[str] = "local repair"
     quick: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_integer("tries", self.tries, minimum=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; yields a map after every patch that reduces the number of inverted triangles."""
@@ -157,12 +155,9 @@ class WideRepair(VertexDescent):
         Maximum number of patches.
     """
 
-    tries: int = 2
+    tries: int = option(2, check=positive)
 
     label: ClassVar[str] = "wide patches"
-
-    def __post_init__(self) -> None:
-        check_integer("tries", self.tries, minimum=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """Yield a map after every patch that leaves fewer inverted triangles."""

@@ -39,7 +39,8 @@ from quasiharmonic.solver.methods.local_repair import (
     untangle_fully,
 )
 from quasiharmonic.solver.methods.untangling import GRADINGS, untangle
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, check_integer, mark, to_points
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray, mark, to_points
+from quasiharmonic.util.options import option, positive, positive_or_none
 
 Generator: TypeAlias = np.random.Generator
 
@@ -80,15 +81,10 @@ class RandomRestarts(VertexDescent):
         Maximum number of patches.
     """
 
-    max_failures: int = 30
-    tries: int | None = None
+    max_failures: int = option(30, check=positive)
+    tries: int | None = option(None, check=positive_or_none)
 
     label: ClassVar[str] = "random restarts"
-
-    def __post_init__(self) -> None:
-        check_integer("max_failures", self.max_failures, minimum=1)
-        if self.tries is not None:
-            check_integer("tries", self.tries, minimum=1)
 
     def iterates(self, objective: Objective, start: Iterate) -> Iterates:
         """See `Descent`; yields a map after every patch that reduces the number of inverted triangles."""

@@ -28,7 +28,8 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.linsolve.laplacian import embed_tutte
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import Iterates, VertexDescent
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, check_integer, scale_to_unit, to_complex
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, scale_to_unit, to_complex
+from quasiharmonic.util.options import option, positive
 
 # Powers of the boundary edges' lengths, tried in this order.
 GRADINGS = 0.5, 0.0, 1.0
@@ -115,12 +116,9 @@ class Untangling(VertexDescent):
         Start from the map of lowest V₃ so far.
     """
 
-    iterations: int = 300
+    iterations: int = option(300, check=positive)
 
     label: ClassVar[str] = "untangling"
-
-    def __post_init__(self) -> None:
-        check_integer("iterations", self.iterations, minimum=1)
 
     def select_start(self, best_map: ComplexArray, lowest_energy: Iterate) -> ComplexArray:
         """Return the map of lowest V₃: the whole mesh moves, so its overall closeness to a solution matters."""

@@ -16,7 +16,7 @@ from quasiharmonic.geometry.mesh.reference import blocks
 from quasiharmonic.solver.field.objective import Iterate, Objective
 from quasiharmonic.solver.methods.base import FunctionalDescent, Iterates
 from quasiharmonic.solver.methods.relocation import RetrySchedule, relocate
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray
 from quasiharmonic.util.kernels import compiled
 
 # Less momentum than Adam's usual 0.9 / 0.999 gives the largest single gain. The objective changes as fast as the map
@@ -108,22 +108,10 @@ class AdamState:
         self._square = np.zeros(triangles)
         self._steps = 0
 
-    def take_part(self, triangles: IntArray | slice) -> AdamState:
-        """Return the state of some of the triangles, to continue separately."""
-        return self._copy_with(self._mean[triangles], self._square[triangles])
-
-    @staticmethod
-    def join(paces: Sequence[AdamState]) -> AdamState:
-        """Concatenate states that have made equally many steps."""
-        return paces[0]._copy_with(
-            np.concatenate([state._mean for state in paces]), np.concatenate([state._square for state in paces])
-        )
-
-    def _copy_with(self, mean: ComplexArray, square: FloatArray) -> AdamState:
-        """Return a state with the same settings and step count."""
+    def take_part(self, triangles: BoolArray) -> AdamState:
+        """Return the state of the triangles in a mask (f,), to continue separately."""
         other = AdamState(0, self._momenta, self._times, self._lengths)
-        # Copy the arrays, because every step changes them.
-        other._mean, other._square, other._steps = np.array(mean), np.array(square), self._steps
+        other._mean, other._square, other._steps = self._mean[triangles], self._square[triangles], self._steps
         return other
 
     def step(self, gradient: ComplexArray) -> ComplexArray:

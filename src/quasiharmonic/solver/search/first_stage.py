@@ -6,25 +6,23 @@ is block diagonal, so one analysis, one factorisation and one solve serve all me
 same as by `Objective`.
 
 VectorAdam treats each triangle separately, so up to rounding every search visits the same maps as it would alone.
-Solved problems leave the batch. After the first iterations the unsolved problems of several batches are joined, and a
-batch is compacted when half of it is solved. After the stage, each unsolved search continues separately.
+Solved problems leave a batch when half of them are solved. After the stage, each unsolved search continues separately.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
+from itertools import compress
 from typing import NamedTuple, TypeGuard
 
 import numpy as np
 
-from quasiharmonic.geometry.exact.certificate import certify_each
 from quasiharmonic.geometry.mesh.reference import ReferenceMesh
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain, Problem
-from quasiharmonic.problem.result import MapResult, Status
+from quasiharmonic.problem.result import Status
 from quasiharmonic.solver.field.objective import (
     Iterate,
     Objective,
@@ -35,12 +33,11 @@ from quasiharmonic.solver.field.objective import (
     sums_of,
     sweep,
 )
-from quasiharmonic.solver.field.tensor import TANH, Parameterisation, TensorField
+from quasiharmonic.solver.field.tensor import TANH, TensorField
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.methods.relocation import RetrySchedule, relocate_each
-from quasiharmonic.solver.methods.vector_adam import AdamState
 from quasiharmonic.solver.search.record import Round, StageRun, visit_rounds
-from quasiharmonic.solver.search.search import Search, result_of
+from quasiharmonic.solver.search.search import Search
 from quasiharmonic.solver.search.stages import Stages, stages_of
 from quasiharmonic.util.arrays import ComplexArray, IntArray, repeat_each
 from quasiharmonic.util.options import MapOptions
@@ -52,9 +49,6 @@ SMALL = 4_000
 # Maximum number of triangles of a batch. Twice as many are not faster per triangle, because the arrays exceed the
 # cache. At this size QDLDL is still the default solver if MKL is not installed.
 MAX_BATCH = 28_000
-# Iterations before batches are joined. After two, nine in ten easy problems are solved; the rest of one batch would be
-# too small.
-_ITERATIONS_APART = 2
 
 
 class Patterns:
@@ -186,7 +180,7 @@ def _is_plain(stage: object) -> TypeGuard[VectorAdam]:
 
 def run_first_stage(
     problems: Sequence[Problem], descent: VectorAdam, patterns: Patterns, options: MapOptions
-) -> list[MapResult | Search | None]:
+) -> list[Search | None]:
     """Run the first stage of many searches in batches.
 
     Parameters
@@ -203,33 +197,19 @@ def run_first_stage(
     Returns
     -------
     list
-        For each problem its result, or the search after the stage. None if rounding broke the factorisation of its
-        batch; a new search must then begin.
+        For each problem the search after the stage, to be completed by `finish_search`. None if rounding broke the
+        factorisation of its batch; a new search must then begin.
     """
     members = []
     searches = [Search(problem, options) for problem in problems]
     for problem, search in zip(problems, searches, strict=True):
         run = search.begin_in_batch(descent)
         members.append(_BatchMember(run, descent.objective(problem, options.linear_solver), RetrySchedule()))
-    end, batches = descent.iterations + 1, []
-    for first, last in _divide([len(problem.F) for problem in problems]):
-        xi = np.zeros(sum(len(problem.F) for problem in problems[first:last]), dtype=np.complex128)
-        batch = _BatchDescent(members[first:last], xi, descent.make_state(xi.size), descent, patterns)
-        batch.run(range(min(_ITERATIONS_APART, end)))
-        batches.append(batch)
-    for batch in _join(batches):
-        batch.run(range(_ITERATIONS_APART, end))
-    runs = [member.run for member in members]
-    for run in runs:
-        run.end(Status.OUT_OF_ITERATIONS)
-    results = iter(_certify([run for run in runs if run.status is Status.INJECTIVE]))
-    found: list[MapResult | Search | None] = []
-    for run, search in zip(runs, searches, strict=True):
-        if run.status is Status.INJECTIVE:
-            found.append(next(results))
-        else:
-            found.append(None if run.status is Status.UNSOLVABLE else search)
-    return found
+    for first, last in _divide([member.size for member in members]):
+        _BatchDescent(members[first:last], descent, patterns).run()
+    for member in members:
+        member.run.end(Status.OUT_OF_ITERATIONS)
+    return [None if search.status is Status.UNSOLVABLE else search for search in searches]
 
 
 class _BatchMember(NamedTuple):
@@ -256,32 +236,27 @@ class _BatchDescent:
     ``xi`` (f,) and ``adam`` have the variables and the state of the triangles of all members, one mesh after another.
     """
 
-    def __init__(
-        self,
-        members: Sequence[_BatchMember],
-        xi: ComplexArray,
-        adam: AdamState,
-        descent: VectorAdam,
-        patterns: Patterns,
-    ) -> None:
-        self.members, self.xi, self.adam, self.descent, self.patterns = members, xi, adam, descent, patterns
+    def __init__(self, members: Sequence[_BatchMember], descent: VectorAdam, patterns: Patterns) -> None:
+        self.members, self.descent, self.patterns = members, descent, patterns
+        self.xi = np.zeros(sum(member.size for member in members), dtype=np.complex128)
+        self.adam = descent.make_state(self.xi.size)
 
-    def run(self, iterations: range) -> None:
+    def run(self) -> None:
         """Descend until all stages have ended or the iterations are over.
 
         If a factorisation fails because of rounding, all stages that still run end as unsolvable.
         """
         try:
-            visit_rounds(self._rounds(iterations))
+            visit_rounds(self._rounds())
         except NotPositiveDefinite:
             for member in self.members:
                 if member.is_running:
                     member.run.status = Status.UNSOLVABLE
 
-    def _rounds(self, iterations: range) -> Iterator[Round]:
+    def _rounds(self) -> Iterator[Round]:
         """Yield the next maps of all stages that still run."""
         since, batch = time.perf_counter(), self._combine()
-        for iteration in iterations:
+        for iteration in range(self.descent.iterations + 1):
             is_running = [k for k, member in enumerate(self.members) if member.is_running]
             maps = batch.evaluate(self.xi)
             yield [(self.members[k].run, batch.iterate(maps, k)) for k in is_running]
@@ -296,9 +271,9 @@ class _BatchDescent:
             if not left:
                 return
             self.xi = batch.step(maps, self.adam.step(maps.gradient))
-            if self._is_too_large(left, iterations.stop - iteration - 1):
-                (fewer,) = _join([self])
-                self.members, self.xi, self.adam = fewer.members, fewer.xi, fewer.adam
+            # The analysis of a pattern takes as long as two iterations.
+            if self.descent.iterations - iteration > 1 and 2 * left <= len(self.members):
+                self._compact()
                 batch = self._combine()
 
     def _combine(self) -> ObjectiveBatch:
@@ -325,43 +300,12 @@ class _BatchDescent:
             return []
         return [(self.members[k].run, here) for k, here in zip(good, batch.of_maps(good, w), strict=True)]
 
-    def _is_too_large(self, left: int, iterations: int) -> bool:
-        """Whether compacting the batch pays, given the number of running members and the iterations to come."""
-        if _have_one_mesh(self.members):
-            return iterations > 0 and 5 * _next_power_of_two(left) <= 3 * len(self.members)
-        # The analysis of a pattern takes as long as two iterations.
-        return iterations > 1 and 2 * left <= len(self.members)
-
-
-def _join(batches: Sequence[_BatchDescent]) -> list[_BatchDescent]:
-    """Join the running members of batches that have made equally many iterations into as few batches as possible."""
-    members = [member for batch in batches for member in batch.members]
-    chosen = [k for k, member in enumerate(members) if member.is_running]
-    if not chosen:
-        return []
-    if _have_one_mesh(members):
-        # Use a power of two as count, so that batches of one mesh recur in equal sizes and their pattern is cached.
-        done = (k for k, member in enumerate(members) if not member.is_running)
-        chosen = sorted([*chosen, *islice(done, _next_power_of_two(len(chosen)) - len(chosen))])
-    ends = np.cumsum([member.size for member in members])
-    xi, adam = np.concatenate([batch.xi for batch in batches]), AdamState.join([batch.adam for batch in batches])
-    descent, patterns, joined = batches[0].descent, batches[0].patterns, []
-    for first, last in _divide([members[k].size for k in chosen]):
-        part = chosen[first:last]
-        triangles = np.concatenate([np.arange(ends[k] - members[k].size, ends[k]) for k in part])
-        own = [members[k] for k in part]
-        joined.append(_BatchDescent(own, xi[triangles], adam.take_part(triangles), descent, patterns))
-    return joined
-
-
-def _have_one_mesh(members: Sequence[_BatchMember]) -> bool:
-    """Whether all members have the same domain."""
-    return len({member.objective.problem.domain for member in members}) == 1
-
-
-def _next_power_of_two(count: int) -> int:
-    """Return the smallest power of two that is not below ``count``."""
-    return 1 << (count - 1).bit_length()
+    def _compact(self) -> None:
+        """Leave out the members whose stages have ended."""
+        is_running = [member.is_running for member in self.members]
+        kept = repeat_each(is_running, [member.size for member in self.members])
+        self.xi, self.adam = self.xi[kept], self.adam.take_part(kept)
+        self.members = list(compress(self.members, is_running))
 
 
 def _divide(sizes: Sequence[int]) -> list[tuple[int, int]]:
@@ -373,29 +317,3 @@ def _divide(sizes: Sequence[int]) -> list[tuple[int, int]]:
             first, total = k, 0
         total += size
     return [*portions, (first, len(sizes))] if sizes else []
-
-
-def _certify(runs: Sequence[StageRun]) -> list[MapResult]:
-    """Certify the maps of solved searches together and return the results."""
-    searches = [run.search for run in runs]
-    problems = [search.problem for search in searches]
-    uv = [search.problem.positions(search.best_map) for search in searches]
-    certificates = certify_each([problem.F for problem in problems], uv, [problem.domain.loops for problem in problems])
-    mu = _beltrami_coefficients([search.best_field for search in searches if search.best_field is not None])
-    parts = zip(runs, uv, certificates, mu, strict=True)
-    return [
-        result_of(run.search, positions, certificate, own, run.seconds) for run, positions, certificate, own in parts
-    ]
-
-
-def _beltrami_coefficients(fields: Sequence[TensorField]) -> list[ComplexArray]:
-    """Return the Beltrami coefficients of each field, computed together."""
-    mu = [np.empty(0, dtype=np.complex128)] * len(fields)
-    alike: dict[Parameterisation, list[int]] = {}
-    for k, field in enumerate(fields):
-        alike.setdefault(field.parameterisation, []).append(k)
-    for parameterisation, indices in alike.items():
-        whole = parameterisation.field(np.concatenate([fields[k].xi for k in indices])).mu
-        for k, own in zip(indices, np.split(whole, np.cumsum([fields[k].xi.size for k in indices])[:-1]), strict=True):
-            mu[k] = own.copy()
-    return mu

@@ -2,7 +2,7 @@
 
 A *group* has consecutive problems, which one thread solves. The first stage of its small problems runs in *batches*:
 the meshes of a batch are combined into one mesh (`quasiharmonic.solver.search.first_stage`). A group has at most as
-many triangles as four full batches, or it is one larger problem.
+many triangles as a full batch, or it is one larger problem.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypedDict, Unpack, get_args
+from typing import Any, TypedDict, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,10 +24,9 @@ from quasiharmonic.energies.polishing import find_energy, polish_options, polish
 from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.io.objects import mesh_arrays, stands_for_mesh
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.problem import set_up_batch
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.solver.search.first_stage import MAX_BATCH, SMALL, Patterns, group_by_first_stage, run_first_stage
-from quasiharmonic.solver.search.search import Search, finish_search, search_map
+from quasiharmonic.solver.search.search import Search, finish_search
 from quasiharmonic.solver.search.stages import STRATEGIES, Stages
 from quasiharmonic.util.arrays import check_callback, check_choice, check_integer, check_sequence
 from quasiharmonic.util.options import MapOptions, takes
@@ -37,20 +36,8 @@ from quasiharmonic.util.threads import count_cores, make_executor
 Arrays = tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 
 
-class GroupTuning(NamedTuple):
-    """Numbers that tune groups of problems."""
-
-    # Maximum size of a group in full batches. The unsolved problems of these batches are joined after the first
-    # iterations.
-    batches: int = 4
-    # A group has at most this part (1 / `divisor`) of the triangles of all groups before it, so that no thread has much
-    # left while the others are idle. It may always have one full batch.
-    divisor: int = 8
-    # Seconds between two calls of the callback while no problem finishes, and between two checks for an interrupt.
-    tick: float = 0.2
-
-
-_TUNING = GroupTuning()
+# Seconds between two calls of the callback while no problem finishes, and between two checks for an interrupt.
+_TICK = 0.2
 
 
 class ManyKeywords(TypedDict, total=False):
@@ -192,7 +179,7 @@ def _wait_for(
     """Wait for the results of a group; meanwhile call the callback regularly and allow Ctrl-C."""
     while True:
         try:
-            return future.result(timeout=_TUNING.tick)
+            return future.result(timeout=_TICK)
         except NotYet:
             if callback is not None:
                 callback(done)
@@ -200,13 +187,11 @@ def _wait_for(
 
 def _group_problems(problems: Iterator[Any]) -> Iterator[tuple[int, list[Any]]]:
     """Yield the number of the first problem of each group and the problems of the group, in order."""
-    first, group, size, before = 0, list[Any](), 0, 0
+    first, group, size = 0, list[Any](), 0
     for given in problems:
         triangles = _count_triangles(given)
-        limit = MAX_BATCH * min(max(before // (_TUNING.divisor * MAX_BATCH), 1), _TUNING.batches)
-        if group and (size + triangles > limit or triangles > SMALL):
+        if group and (size + triangles > MAX_BATCH or triangles > SMALL):
             yield first, group
-            before += size
             first, group, size = first + len(group), [], 0
         group.append(given)
         size += triangles
@@ -234,9 +219,8 @@ class _Worker:
 
     def solve(self, first: int, group: Sequence[Any]) -> list[MapResult | Exception]:
         """Return the result or the exception of each problem; ``first`` is the number of the first problem."""
-        ready = self._set_up_small(group)
-        posed = [self._set_up(first + k, given, ready.get(k)) for k, given in enumerate(group)]
-        begun: dict[int, MapResult | Search] = {}
+        posed = [self._set_up(first + k, given) for k, given in enumerate(group)]
+        begun: dict[int, Search] = {}
         problems = {k: one for k, one in enumerate(posed) if not isinstance(one, Exception)}
         for descent, keys in group_by_first_stage(problems, self._options.strategy):
             outcomes = run_first_stage([problems[k] for k in keys], descent, self._patterns, self._options)
@@ -246,29 +230,8 @@ class _Worker:
             for k, problem in enumerate(posed)
         ]
 
-    def _set_up_small(self, group: Sequence[Any]) -> dict[int, Problem]:
-        """Set up the problems with small meshes given as arrays together; return {} if one of them is invalid."""
-        if self._reference is not None:
-            return {}
-        new = dict[int, Any]()
-        before: Sequence[Any] | None = None
-        if self._last is not None:
-            before = self._last.V, self._last.F, self._last.fixed
-        for k, given in enumerate(group):
-            if isinstance(given, Problem):
-                continue
-            if not isinstance(given, Sequence) or len(given) != 4:
-                return {}
-            if not all(isinstance(array, np.ndarray) for array in given) or _count_triangles(given) > SMALL:
-                return {}
-            if before is None or not all(map(_is_same, before, given[:3])):
-                new[k] = given
-            before = given[:3]
-        posed = set_up_batch(list(new.values())) if len(new) > 1 else None
-        return {} if posed is None else dict(zip(new, posed, strict=True))
-
-    def _set_up(self, number: int, given: Any, ready: Problem | None) -> Problem | Exception:
-        """Set up a problem, on the previous problem's domain if it is the same, or use ``ready`` if it is given."""
+    def _set_up(self, number: int, given: Any) -> Problem | Exception:
+        """Set up a problem, on the previous problem's domain if it is the same."""
         self._check_wanted()
         if isinstance(given, Problem):
             return given
@@ -278,23 +241,18 @@ class _Worker:
             if not isinstance(given, Sequence) or len(given) != 4:
                 raise ValueError("give each as a Problem, as V, F, fixed, target or as mesh, fixed, target")
             V, F, fixed, target = given
-            last, reference = self._last, self._reference
+            last = self._last
             if last is not None and _is_same(last.V, V) and _is_same(last.F, F) and _is_same(last.fixed, fixed):
                 return last.with_target(target)
-            self._last = Problem(V, F, fixed, target, reference=reference) if ready is None else ready
+            self._last = Problem(V, F, fixed, target, reference=self._reference)
         except Exception as error:
             return _add_number(number, error)
         return self._last
 
-    def _finish(self, number: int, problem: Problem, begun: MapResult | Search | None) -> MapResult | Exception:
-        """Complete the search for one problem, from its result or its search after the first stage."""
+    def _finish(self, number: int, problem: Problem, begun: Search | None) -> MapResult | Exception:
+        """Complete the search for one problem, which may have had its first stage."""
         try:
-            if isinstance(begun, MapResult):
-                result = begun
-            elif begun is None:
-                result = search_map(problem, self._options)
-            else:
-                result = finish_search(begun, self._options.strategy, begun.work.stages[0].seconds)
+            result = finish_search(begun or Search(problem, self._options), self._options.strategy)
             if self._options.polish is not None and result.status is Status.INJECTIVE:
                 result = polish_result(problem, result, polish_options(self._options))
             if result.status is Status.INTERRUPTED:

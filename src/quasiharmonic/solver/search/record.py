@@ -119,6 +119,12 @@ class SearchRecord:
         # Last, because the callback may end the search.
         self.work.record(inverted, here.energy, lambda: self.problem.positions(here.w))
 
+    def record_stage(self, name: str, first_step: int, seconds: float, before: tuple[int, float], kept: bool) -> None:
+        """Append the report of a stage that began with a step of the history and with a best map as ``before``."""
+        n_iterations, best = max(len(self.work.history) - first_step, 0), self.best
+        inverted, energy = (before[0], best[0]), (before[1], best[1])
+        self.work.stages.append(Stage(name, n_iterations, seconds, inverted, energy, kept))
+
     def replace_best(self, w: ComplexArray, inverted: int) -> None:
         """Replace the best map by ``w`` with its own tensors."""
         mesh = self.problem.domain.mesh("equilateral")
@@ -174,17 +180,8 @@ class StageRun:
     def record(self) -> None:
         """Append the report of this stage to those of the search."""
         best, before = self.search.best, self._before
-        first = before or best
-        self.search.work.stages.append(
-            Stage(
-                name=self.stage.name,
-                n_iterations=max(len(self.search.work.history) - self._first_step, 0),
-                seconds=self.seconds,
-                inverted=(first[0], best[0]),
-                energy=(first[1], best[1]),
-                kept=best != before or self.status is Status.INJECTIVE,
-            )
-        )
+        kept = best != before or self.status is Status.INJECTIVE
+        self.search.record_stage(self.stage.name, self._first_step, self.seconds, before or best, kept)
 
 
 #: The next maps of some stages.

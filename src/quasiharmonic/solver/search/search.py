@@ -18,12 +18,12 @@ import numpy as np
 
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.coarsening import coarsen
-from quasiharmonic.geometry.exact.certificate import Certificate, certify
+from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.geometry.prolongation import prolong
 from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.problem import Domain, Frame, Problem
-from quasiharmonic.problem.result import MapResult, Stage, Status
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import finish
 from quasiharmonic.solver.methods import Descent, LineShift, Newton, Untangling, VectorAdam
 from quasiharmonic.solver.methods.base import SearchState
@@ -211,16 +211,8 @@ class Search(SearchRecord):
                     if status is not Status.INTERRUPTED:
                         self.work.record(*self.best)
         finally:
-            self.work.stages.append(
-                Stage(
-                    name=f"{name}, {len(problem.F)} triangles",
-                    n_iterations=max(len(self.work.history) - done, 0),
-                    seconds=time.perf_counter() - began,
-                    inverted=(before.best[0], self.best[0]),
-                    energy=(before.best[1], self.best[1]),
-                    kept=self.best != before.best,
-                )
-            )
+            name, seconds = f"{name}, {len(problem.F)} triangles", time.perf_counter() - began
+            self.record_stage(name, done, seconds, before.best, self.best != before.best)
         if status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         if self.best != before.best and self.best[0]:
@@ -284,28 +276,19 @@ def search_map(problem: Problem, options: MapOptions, repairs: RepairBudget | No
     return finish_search(Search(problem, options, repairs), options.strategy)
 
 
-def finish_search(search: Search, strategy: str | Stages, spent: float = 0.0) -> MapResult:
+def finish_search(search: Search, strategy: str | Stages) -> MapResult:
     """Run the stages of a search that have not run yet and certify the best map.
 
-    The search is new, or its first stage ran in a batch. It took ``spent`` seconds before.
+    The search is new, or its first stage ran in a batch.
     """
-    began = time.perf_counter()
-    search.run(stages_of(strategy, search.problem))
+    began, spent = time.perf_counter(), sum(stage.seconds for stage in search.work.stages)
+    if search.status is not Status.INJECTIVE:
+        search.run(stages_of(strategy, search.problem))
     uv = search.problem.positions(search.best_map)
     certificate, interrupted = finish(lambda: certify(search.problem.F, uv, loops=search.problem.domain.loops))
     if interrupted:
         search.status = Status.INTERRUPTED
-    mu = None if search.best_field is None else search.best_field.mu
-    return result_of(search, uv, certificate, mu, spent + time.perf_counter() - began)
-
-
-def result_of(
-    search: SearchRecord, uv: FloatArray, certificate: Certificate, mu: ComplexArray | None, seconds: float
-) -> MapResult:
-    """Return the result of a search from its map (n, 2), the map's certificate and its tensors' μ (f,).
-
-    An interrupted search stays so even if its map is injective: what follows a search does not begin then.
-    """
+    # An interrupted search stays so even if its map is injective: what follows a search does not begin then.
     found = certificate.injective and search.status is not Status.INTERRUPTED
     return MapResult(
         uv=uv,
@@ -316,8 +299,8 @@ def result_of(
         path=search.work.path,
         diagnosis=search.diagnosis,
         linear_solver=search.linear_solver,
-        seconds=seconds,
-        mu=mu,
+        seconds=spent + time.perf_counter() - began,
+        mu=None if search.best_field is None else search.best_field.mu,
         reference=search.best_reference,
         V=search.problem.V,
     )

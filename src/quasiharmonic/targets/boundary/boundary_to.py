@@ -202,16 +202,8 @@ def boundary_to(
     space = in_space(surface.V)
     if isinstance(corners, str) and corners != "auto":
         raise ValueError(f'corners are boundary vertices or "auto", not {corners!r}')
-    by_angle = isinstance(corners, str)
-    pins = Pins(
-        None if isinstance(corners, str) else corners,
-        loops,
-        contours,
-        [one.reversed for one in found],
-        corner_angle,
-        exponent,
-        count,
-    )
+    by_angle, listed = isinstance(corners, str), None if isinstance(corners, str) else corners
+    pins = Pins(listed, loops, contours, [one.reversed for one in found], corner_angle, exponent, count)
     to = dict(pins.contour_of)
     if 0 not in to.values():
         # Of the loops without a given contour, the one that encloses the largest area goes to the outer contour.

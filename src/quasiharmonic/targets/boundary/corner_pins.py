@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.curves.arcs import nearest_on_segments
+from quasiharmonic.geometry.exact.loops import join_items
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.io.untrusted import integer
@@ -32,11 +33,11 @@ from quasiharmonic.util.arrays import (
     describe,
     index_array,
     pad_to_space,
+    reject,
     scale_to_unit,
     to_complex,
     triangle_array,
     vertex_array,
-    vertex_names,
 )
 
 Corners = Sequence[int] | Mapping[int, int | ArrayLike]
@@ -119,11 +120,9 @@ class Pins:
             raise ValueError("corners must name boundary vertices by their integer indices")
         check_range("corners", vertices, n)
         alone, times = np.unique(vertices, return_counts=True)
-        if (times > 1).any():
-            raise ValueError(f"corners name {vertex_names(alone[times > 1])} more than once")
+        reject(alone[times > 1], "vertex", "vertices", "corners name {} more than once")
         inner = np.setdiff1d(alone, np.concatenate(self.loops))
-        if inner.size:
-            raise ValueError(f"{vertex_names(inner)} in corners, but not on the boundary")
+        reject(inner, "vertex", "vertices", "{} in corners, but not on the boundary")
 
     def along(self, loop: int, contour: int) -> list[tuple[int, float]]:
         """Return (position in the loop, parameter along its contour) for each pin, in order around the contour."""
@@ -169,8 +168,7 @@ class Pins:
     def _list_corners(self, contour: int) -> str:
         """List the corners of a contour with their numbers, for messages."""
         points = np.ldexp(self.contours[contour][self.sharp[contour]], self.exponent).tolist()
-        named = [f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)]
-        return ", ".join(named[: self._MAX_LISTED]) + (", …" if len(named) > self._MAX_LISTED else "")
+        return join_items([f"{k} at ({x:g}, {y:g})" for k, (x, y) in enumerate(points)], self._MAX_LISTED)
 
     def _find_on_outline(self, point: FloatArray, vertex: int) -> tuple[int, float]:
         """Return the contour on which a point lies and the parameter along it."""

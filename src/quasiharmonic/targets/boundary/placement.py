@@ -36,12 +36,12 @@ from quasiharmonic.util.arrays import (
     cyclic_pairs,
     fixed_vertices,
     invert_indices,
+    reject,
     scale_to_unit,
     target_positions,
     to_complex,
     triangle_array,
     triangle_rows,
-    vertex_names,
 )
 
 # Maximum shift of a vertex to a corner, as a share of the loop. Beyond it, the target no longer resembles the surface,
@@ -271,9 +271,7 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
     fixed = fixed_vertices(fixed, n)
     places = target_positions(target, len(fixed))
     found = edges(F, n)
-    missing = np.setdiff1d(found.boundary, fixed)
-    if missing.size:
-        raise ValueError(f"the boundary {vertex_names(missing)} not in fixed")
+    reject(np.setdiff1d(found.boundary, fixed), "vertex", "vertices", "the boundary {} not in fixed")
     places = scale_to_unit(places)
     position = np.full((n, 2), np.nan)
     position[fixed] = places

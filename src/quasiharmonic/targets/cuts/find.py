@@ -29,8 +29,8 @@ from quasiharmonic.util.arrays import (
     check_range,
     edge_array,
     real_array,
+    reject,
     triangle_array,
-    triangle_names,
     vertex_array,
 )
 
@@ -223,8 +223,7 @@ def side_costs(edge_costs: ArrayLike, count: int) -> FloatArray:
     if costs.shape != (count, 3):
         raise ValueError(f"edge_costs must have shape ({count}, 3), not {costs.shape}")
     wrong = np.flatnonzero(~((costs > 0) & np.isfinite(costs)).all(axis=1))
-    if wrong.size:
-        raise ValueError(f"edge_costs must be positive and finite: {triangle_names(wrong)}")
+    reject(wrong, "triangle", "triangles", "edge_costs must be positive and finite: {}")
     return costs
 
 

@@ -16,7 +16,15 @@ from scipy.sparse.csgraph import dijkstra
 from quasiharmonic.geometry.coarsening import has_marked_corner, mark_rings
 from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, pair_keys, pair_sides
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, pad_to_space, repeat_each, scale_to_unit
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    enumerate_each,
+    mark,
+    pad_to_space,
+    scale_to_unit,
+)
 
 # A concave edge with this dihedral bend, or a convex edge with twice as much, has half its cost.
 _SHARP = 0.5 * np.pi
@@ -77,9 +85,7 @@ class EdgeGraph:
 
     def mark_vertices(self, chosen: BoolArray) -> BoolArray:
         """Mask (n,) of the vertices that belong to any of the chosen edges (e,)."""
-        found = np.zeros(self.n, dtype=bool)
-        found[self.ends.compress(chosen, axis=0)] = True
-        return found
+        return mark(self.n, self.ends.compress(chosen, axis=0))
 
     @cached_property
     def half_edges(self) -> tuple[IntArray, IntArray]:
@@ -113,9 +119,8 @@ class EdgeGraph:
         start, star = self._stars
         triangles = np.empty(0, dtype=np.int64)
         for _ in range(rings):
-            count = start[vertices + 1] - start[vertices]
-            first = repeat_each(start[vertices] - np.cumsum(count) + count, count)
-            triangles = find_distinct(star[first + np.arange(first.size)])
+            which, nth = enumerate_each(start[vertices + 1] - start[vertices])
+            triangles = find_distinct(star[start[vertices][which] + nth])
             vertices = find_distinct(self.F[triangles])
         side = self.side[:, triangles]
         own = find_distinct(side)

@@ -26,7 +26,7 @@ from scipy.sparse.csgraph import dijkstra
 from quasiharmonic.geometry.coarsening import Removal, coarsen
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys, label_components, pair_keys
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph, find_distinct, triangles_near
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.progress import heartbeat
 
@@ -249,8 +249,7 @@ def cross_ring(
     joined = halves[inner & (opposite >= 0)]
     node = label_components(joined, following[opposite[joined]], halves.size)
     tail, head = node, node[following]
-    on_border = np.zeros(halves.size, dtype=bool)
-    on_border[tail[~inner]] = on_border[head[~inner]] = True
+    on_border = mark(halves.size, tail[~inner], head[~inner])
     loop = np.where(on_border, label_components(tail[~inner], head[~inner], halves.size), -1)
     near, far = loop[node[start]], loop[node[goal]]
     if near < 0 or far < 0 or near == far:
@@ -312,8 +311,7 @@ def cut_by_levels(
     """
     n = len(V)
     rim = boundary_edges(F, n)
-    fixed = np.zeros(n, dtype=bool)
-    fixed[rim] = True
+    fixed = mark(n, rim)
     coarsening = coarsen(F, n, fixed, goal)
     rim_keys = pair_keys(rim, n)
     factors = [None] * (len(coarsening.rounds) + 1) if costs is None else _vertex_costs(F, costs, coarsening.rounds, n)
@@ -326,10 +324,8 @@ def cut_by_levels(
         cut = insert_vertices(cut, coarsening.rounds[k], n)
         if k in coarsening.levels:
             heartbeat()
-            marked = np.zeros(n, dtype=bool)
-            marked[cut] = True
             T = coarsening.levels[k]
-            near = triangles_near(T, marked, rings)
+            near = triangles_near(T, mark(n, cut), rings)
             some = costs[near] if k == 0 and costs is not None else _side_costs(factors[k], T[near])
             cut = _shorten(*_make_subset(V, T[near], some, rim_keys), cut)
     return cut
@@ -398,8 +394,7 @@ def insert_vertices(cut: IntArray, removals: list[Removal], n: int) -> IntArray:
 
 def _shorten(vertices: IntArray, graph: EdgeGraph, cut: IntArray) -> IntArray:
     """Shorten cuts (k, 2) close to where they are; returned are edges, smaller vertex first."""
-    on_cut = np.zeros(len(graph.ends), dtype=bool)
-    on_cut[graph.numbers(*np.searchsorted(vertices, cut).T)] = True
+    on_cut = mark(len(graph.ends), graph.numbers(*np.searchsorted(vertices, cut).T))
     return vertices[graph.ends[shorten_cuts(graph, on_cut, rings=_RINGS)]]
 
 

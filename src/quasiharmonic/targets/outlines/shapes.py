@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from itertools import groupby
+from operator import itemgetter
 
 import numpy as np
 
@@ -193,16 +195,15 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
         With the line number, when a line does not have two numbers, a contour has fewer than three points or no area,
         or the file has more than a million points or none. As `nested` for contours that meet themselves or each other.
     """
-    loops: list[list[tuple[float, float]]] = [[]]
-    starts, count = [0], 0
+    # Number of the contour, line and position of each point.
+    points: list[tuple[int, int, tuple[float, float]]] = []
+    number_of_contour = 0
     for line, raw in enumerate(read_text(path).split(b"\n"), 1):
         text, comment, _ = raw.partition(b"#")
         words = text.translate(_SEPARATORS).split()
         if not words:
             # A comment line does not end a contour.
-            if loops[-1] and not comment:
-                loops.append([])
-                starts.append(line)
+            number_of_contour += not comment
             continue
         if line == 1 and not any(map(is_number, words)):
             continue
@@ -212,17 +213,14 @@ def read_polylines(path: str | os.PathLike[str]) -> list[FloatArray]:
             x, y = map(number, words)
         except ValueError as error:
             raise MeshFileError(path, str(error), line) from None
-        if not loops[-1]:
-            starts[-1] = line
-        loops[-1].append((x, y))
-        count += 1
-        if count > MAX_POINTS:
+        points.append((number_of_contour, line, (x, y)))
+        if len(points) > MAX_POINTS:
             raise MeshFileError(path, f"more than {MAX_POINTS:,} points", line, "use fewer points")
     contours, begins = [], []
-    for loop, start in zip(loops, starts, strict=True):
-        if not loop:
-            continue
-        contour = drop_close_points(np.array(loop), 0.0)
+    for _, group in groupby(points, key=itemgetter(0)):
+        loop = list(group)
+        start, positions = loop[0][1], np.array([position for _, _, position in loop])
+        contour = drop_close_points(positions, 0.0)
         if len(contour) < 3 or is_collinear(contour):
             what = f"a contour of {len(contour)} different points that encloses no area begins"
             raise MeshFileError(path, what, start, "use blank lines only between contours")

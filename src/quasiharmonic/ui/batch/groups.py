@@ -1,8 +1,7 @@
 """Solve small problems of a data set together, in one worker process.
 
 For meshes of some hundred triangles the overhead of NumPy calls exceeds the computation. So several problems are read,
-their first search stages run in a batch (`quasiharmonic.solver.search.first_stage`), and their maps are certified
-together.
+and their first search stages run in a batch (`quasiharmonic.solver.search.first_stage`).
 A problem solved here gets the same map and record as alone. All other problems are left untouched and solved
 individually: unreadable files, meshes with several islands, large meshes, and searches that need more than one stage.
 Failures here therefore cost only time.
@@ -11,7 +10,7 @@ Failures here therefore cost only time.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,9 +22,9 @@ from quasiharmonic.io.errors import FileInUseError
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.linsolve import available
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.problem import Given, set_up_batch
-from quasiharmonic.problem.result import MapResult
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.search.first_stage import SMALL, Patterns, group_by_first_stage, run_first_stage
+from quasiharmonic.solver.search.search import finish_search
 from quasiharmonic.ui.batch import island_problems, memory, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
@@ -111,13 +110,12 @@ def read_problem(job: Job) -> _ReadProblem:
 
 def _find_single_islands(read: dict[int, _ReadProblem], settings: dict[str, Any]) -> dict[int, _SingleIsland]:
     """Return the problems of the meshes that form a single problem on all their vertices."""
-    plain = [k for k, one in read.items() if settings["to"] is None and _plain(one, settings)]
-    with _time_shared([read[k].record for k in plain], "setup"):
-        problems = set_up_batch([_arrays(read[k]) for k in plain]) if plain else None
-    posed = {k: _SingleIsland(one, read[k].mesh.with_map) for k, one in zip(plain, problems or [], strict=False)}
+    posed = {}
     for k, one in read.items():
-        if k not in posed and (settings["to"] is not None or one.mesh.FT is not None):
-            with suppress(Exception), metadata.time_phase(one.record, "setup"):
+        with suppress(Exception), metadata.time_phase(one.record, "setup"):
+            if settings["to"] is None and _plain(one, settings):
+                posed[k] = _SingleIsland(_make_problem(one), one.mesh.with_map)
+            elif settings["to"] is not None or one.mesh.FT is not None:
                 surface = island_problems.make_surface(one.mesh, settings)
                 islands = surface.islands
                 if len(islands) == 1 and np.array_equal(islands[0].vertices, np.arange(len(one.mesh.V))):
@@ -134,12 +132,12 @@ def _plain(one: _ReadProblem, settings: dict[str, Any]) -> bool:
     return len(mesh.vt) == len(mesh.V) and np.array_equal(mesh.FT, mesh.F)
 
 
-def _arrays(one: _ReadProblem) -> Given:
-    """Return the arguments of `Problem`."""
+def _make_problem(one: _ReadProblem) -> Problem:
+    """Return the problem of a mesh whose texture coordinates are the positions of its vertices."""
     assert one.fixed is not None
     assert one.mesh.vt is not None
     held = np.unique(one.fixed)
-    return one.mesh.V, one.mesh.F, held, one.mesh.vt[held]
+    return Problem(one.mesh.V, one.mesh.F, held, one.mesh.vt[held])
 
 
 def _with_map(mesh: io.MeshData, surface: SeamedMesh, uv: FloatArray) -> io.MeshData:
@@ -152,9 +150,11 @@ def _solve_first_stage(problems: dict[int, Problem], settings: dict[str, Any]) -
         patterns = Patterns(solver_for(problems[some[0]], settings["linear_solver"]))
         options = MapOptions(max_iterations=settings["max_iterations"], linear_solver=settings["linear_solver"])
         found = run_first_stage([problems[k] for k in some], descent, patterns, options)
-        for k, result in zip(some, found, strict=True):
-            if isinstance(result, MapResult) and result.injective:
-                yield k, result
+        for k, search in zip(some, found, strict=True):
+            if search is not None and search.status is Status.INJECTIVE:
+                result = finish_search(search, search_stages(settings))
+                if result.injective:
+                    yield k, result
 
 
 def _read_map(mesh: io.MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -162,14 +162,3 @@ def _read_map(mesh: io.MeshData) -> tuple[FloatArray, IntArray, FloatArray]:
     if mesh.vt is not None and len(mesh.vt) == len(mesh.V) and mesh.FT is not None and np.array_equal(mesh.FT, mesh.F):
         return mesh.V, mesh.F, mesh.vt
     return io.cut_at_seams(mesh)
-
-
-@contextmanager
-def _time_shared(some: Sequence[Record], phase: str) -> Iterator[None]:
-    """Measure the time of a block and add an equal share to the given phase of each record."""
-    times: Record = {}
-    with metadata.time_phase(times, phase):
-        yield
-    for record in some:
-        name, seconds = f"seconds_{phase}", times[f"seconds_{phase}"]
-        record[name] = record.get(name, 0.0) + seconds / len(some)
