@@ -82,7 +82,7 @@ def parse_tables(data: bytes) -> PlyTables:
     if ending is None:
         raise ValueError("its header does not end")
     order, declared, remarks = _header(data[first.end() : ending.start()].split(newline))
-    reader = _TableReader(data, ending.end(), order)
+    reader = _PlyReader(data, ending.end(), order)
     return PlyTables(tuple(Element(name, rows, reader.columns(rows, of)) for name, rows, of in declared), remarks)
 
 
@@ -132,7 +132,7 @@ def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Propert
     return order, declared, tuple(remarks)
 
 
-class _TableReader:
+class _PlyReader:
     """Reads the tables of a file one after another; the numbers of a text file as if they were stored as doubles."""
 
     def __init__(self, data: bytes, at: int, order: str) -> None:

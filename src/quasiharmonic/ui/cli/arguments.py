@@ -83,11 +83,16 @@ def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option)
 
 
 def add_files(
-    parser: argparse.ArgumentParser, source: str, output: str, *, metavar: tuple[str, str] = ("INPUT", "OUTPUT")
+    parser: argparse.ArgumentParser,
+    source: str,
+    output: str | None = None,
+    *,
+    metavar: tuple[str, ...] = ("INPUT", "OUTPUT"),
 ) -> None:
-    """Add the input, and ``--output``, with these help texts and names."""
+    """Add the input, and ``--output`` if it is given, with these help texts and names."""
     parser.add_argument("input", type=Path, metavar=metavar[0], help=source)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar=metavar[1], help=output)
+    if output is not None:
+        parser.add_argument("-o", "--output", type=Path, required=True, metavar=metavar[1], help=output)
 
 
 def pick(given: argparse.Namespace, *names: str) -> dict[str, Any]:
