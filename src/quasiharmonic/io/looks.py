@@ -32,7 +32,7 @@ from quasiharmonic.io.models.appearance import (
 )
 from quasiharmonic.io.models.meshdata import MeshData, colours_of
 from quasiharmonic.io.models.textures import Texture, texture_of
-from quasiharmonic.io.untrusted import read_bytes, resolve_beside
+from quasiharmonic.io.untrusted import is_number, read_bytes, resolve_beside
 
 # Entries of material libraries about images that `read_appearance` reads.
 _IMAGES: dict[bytes, Role] = {b"map_Kd": "colour", b"map_Ke": "emission"}
@@ -128,7 +128,7 @@ def _image_options(words: Sequence[bytes]) -> tuple[dict[bytes, list[bytes]], st
     at = 1
     while at < len(words) - 1 and (most := _IMAGE_OPTIONS.get(words[at])):
         end = at + 1
-        while end < len(words) - 1 and end <= at + most and (most < 3 or _is_number(words[end])):
+        while end < len(words) - 1 and end <= at + most and (most < 3 or is_number(words[end])):
             end += 1
         options[words[at]] = list(words[at + 1 : end])
         at = end
@@ -136,14 +136,6 @@ def _image_options(words: Sequence[bytes]) -> tuple[dict[bytes, list[bytes]], st
     name = os.fsdecode(words[-1] if words[at].startswith(b"-") else b" ".join(words[at:]))
     # Some programs quote names, or write the separators of Windows.
     return options, name.strip('"').replace("\\", "/")
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _read_image(mesh: MeshData, name: Path) -> NamedImage:
