@@ -134,10 +134,8 @@ def count(text: str) -> int:
 
 def byte_count(text: str) -> int:
     """Convert a size such as 800M or 4G to bytes; for argparse."""
-    found = re.fullmatch(r"([0-9.]+)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
-    value = 0.0
-    if found is not None and found[1].count(".") < 2 and found[1] != ".":
-        value = float(found[1]) * 1024 ** " KMGT".index(found[2].upper() or " ")
+    found = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
+    value = 0.0 if found is None else float(found[1]) * 1024 ** " KMGT".index(found[2].upper() or " ")
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a size such as 800M or 4G")
     return int(value)

@@ -179,8 +179,7 @@ def run(options: argparse.Namespace) -> int:
     records = places.join(options.output, table_name(read_shard(options.shard), options.table))
     with report.after_writing(records):
         print(_account(progress, wanted, records), flush=True)
-    if options.report:
-        with report.after_writing(records):
+        if options.report:
             _write_report(options)
     return 0 if progress.solved == progress.total else 1
 
