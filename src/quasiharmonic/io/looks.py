@@ -17,8 +17,8 @@ from urllib.parse import quote
 import numpy as np
 
 from quasiharmonic.io.errors import MeshFileError
-from quasiharmonic.io.formats.gltf import document as gltf
-from quasiharmonic.io.formats.gltf.looks import find_objects, gltf_appearance
+from quasiharmonic.io.formats.gltf.document import DAMAGE, find_objects
+from quasiharmonic.io.formats.gltf.looks import first_colour_image, gltf_appearance
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf
 from quasiharmonic.io.models.appearance import (
     Appearance,
@@ -32,11 +32,10 @@ from quasiharmonic.io.models.appearance import (
 )
 from quasiharmonic.io.models.meshdata import MeshData, colours_of
 from quasiharmonic.io.models.textures import Texture, texture_of
-from quasiharmonic.io.untrusted import read_bytes, resolve_beside
+from quasiharmonic.io.untrusted import is_number, read_bytes, resolve_beside
 
 # Entries of material libraries about images that `read_appearance` reads.
 _IMAGES: dict[bytes, Role] = {b"map_Kd": "colour", b"map_Ke": "emission"}
-_GLTF = ".glb", ".gltf"
 # Options of images in material libraries by their largest number of values. All values are required, except those of
 # the first three, which are one to three numbers.
 _IMAGE_OPTIONS = {
@@ -129,7 +128,7 @@ def _image_options(words: Sequence[bytes]) -> tuple[dict[bytes, list[bytes]], st
     at = 1
     while at < len(words) - 1 and (most := _IMAGE_OPTIONS.get(words[at])):
         end = at + 1
-        while end < len(words) - 1 and end <= at + most and (most < 3 or _is_number(words[end])):
+        while end < len(words) - 1 and end <= at + most and (most < 3 or is_number(words[end])):
             end += 1
         options[words[at]] = list(words[at + 1 : end])
         at = end
@@ -137,14 +136,6 @@ def _image_options(words: Sequence[bytes]) -> tuple[dict[bytes, list[bytes]], st
     name = os.fsdecode(words[-1] if words[at].startswith(b"-") else b" ".join(words[at:]))
     # Some programs quote names, or write the separators of Windows.
     return options, name.strip('"').replace("\\", "/")
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _read_image(mesh: MeshData, name: Path) -> NamedImage:
@@ -162,8 +153,9 @@ def own_texture(mesh: MeshData) -> Texture | None:
     None if the file names none, or the image is missing or has another format. No file is opened outside the folder of
     the mesh's file.
     """
-    if Path(mesh.source).suffix.lower() in _GLTF:
-        return _of_gltf(Path(mesh.source))
+    if isinstance(mesh.carried, CarriedGltf):
+        data = first_colour_image(mesh.carried)
+        return None if data is None else texture_of(data)
     for words, within in library_entries(mesh):
         if words[0] == b"map_Kd":
             data = _read_image(mesh, within / _image_options(words)[1]).data
@@ -177,11 +169,10 @@ def texture_names(mesh: MeshData) -> list[str]:
 
     No image is opened.
     """
-    if Path(mesh.source).suffix.lower() in _GLTF:
-        tree = mesh.carried.document.tree if isinstance(mesh.carried, CarriedGltf) else {}
+    if isinstance(mesh.carried, CarriedGltf):
         try:
-            return list(dict.fromkeys(_names_in_gltf(tree)))
-        except gltf.DAMAGE:
+            return list(dict.fromkeys(_names_in_gltf(mesh.carried.document.tree)))
+        except DAMAGE:
             # A damaged description of a material does not prevent other work.
             return []
     textures = (_image_options(words)[1] for words, _ in library_entries(mesh) if _IMAGE_KEYWORD.fullmatch(words[0]))
@@ -226,22 +217,3 @@ def is_beside(folder: Path, name: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _of_gltf(path: Path) -> Texture | None:
-    """Return the base colour texture of a glTF file."""
-    document = gltf.load(path)
-    tree = document.tree
-    try:
-        for material in tree.get("materials", []):
-            colour = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-            if colour is None:
-                continue
-            image = tree["images"][tree["textures"][colour["index"]]["source"]]
-            if "bufferView" in image:
-                return texture_of(bytes(document.views[image["bufferView"]]))
-            return texture_of(gltf.read_uri(path.parent, image["uri"]))
-    except gltf.DAMAGE:
-        # A damaged description of a material does not prevent drawing.
-        return None
-    return None

@@ -19,7 +19,7 @@ import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.atomic import check_writable
-from quasiharmonic.io.errors import MeshFileError, check_path
+from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
 from quasiharmonic.io.formats.gltf.reader import CarriedGltf, read_channel
 from quasiharmonic.io.formats.ply import CarriedPly, read_second_places
 from quasiharmonic.io.models.mesh_maps import vertex_places, with_corner_map
@@ -331,10 +331,8 @@ def read_handles(path: str | os.PathLike[str], n: int) -> IntArray:
     # Each vertex is stored once, so the memory is bounded by the mesh size.
     seen: dict[int, int] = {}
     for line, text in content_lines(read_text(path)):
-        try:
+        with report_damage(path, line=line, remedy="give one vertex index per line"):
             vertex = integer(text)
-        except ValueError as error:
-            raise MeshFileError(path, str(error), line, "give one vertex index per line") from None
         if not 0 <= vertex < n:
             raise MeshFileError(
                 path, f"vertex {vertex} does not exist in a mesh of {n} vertices", line, "indices count from 0"

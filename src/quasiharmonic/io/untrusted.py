@@ -323,8 +323,6 @@ def read_rows(path: str | os.PathLike[str], columns: int, names: Sequence[bytes]
             continue
         if len(words) != columns:
             raise MeshFileError(path, f"not {count_of('number', 'numbers', columns)}: {quote_token(text)}", at)
-        try:
+        with report_damage(path, line=at):
             rows.append((at, [number(word) for word in words]))
-        except ValueError as error:
-            raise MeshFileError(path, str(error), at) from None
     return rows

@@ -46,6 +46,8 @@ _TAG = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""")
 _LZMA_MEMORY = 128 << 20
 # A function that compresses bytes, and a factory of decompressors.
 _Coder = tuple[Callable[[bytes], bytes], Callable[[], Any]]
+# A function of a file, a position and a number of bytes: these bytes, decoded, and the position after them.
+_Take = Callable[[bytes, int, int], tuple[bytes, int]]
 _CODERS: dict[str, _Coder] = {
     "vtkZLibDataCompressor": (zlib.compress, zlib.decompressobj),
     "vtkLZMADataCompressor": (lzma.compress, partial(lzma.LZMADecompressor, memlimit=_LZMA_MEMORY)),
@@ -138,10 +140,11 @@ class _VtuFile:
         if compressor is not None and compressor not in _CODERS:
             raise ValueError(f"it is compressed by {compressor}: save it with ZLib or without compression")
         self._coder = None if compressor is None else _CODERS[compressor]
-        self._appended, self._raw = -1, False
+        self._appended, self._take_appended = -1, _take_base64
         if tag is not None:
             self._appended = data.index(b"_", tag.end()) + 1
-            self._raw = b'"raw"' in tag.group().replace(b"'", b'"')
+            if b'"raw"' in tag.group().replace(b"'", b'"'):
+                self._take_appended = _take_raw
 
     def last_arrays(self, parent: str) -> dict[str, _Array]:
         """Return the arrays of an element by name; the last one for several times."""
@@ -218,14 +221,13 @@ class _VtuFile:
 
         Compressed data of more than ``max_bytes`` bytes raise a `ValueError`.
         """
-        begin, raw = self._find_bytes(array)
-        take = _take_raw if raw else _take_base64
+        begin, take = self._find_bytes(array)
         size = self._word.itemsize
-        if self._coder is None:
-            (length,) = np.frombuffer(take(self._data, begin, size)[0], self._word).tolist()
-            block, end = take(self._data, begin, size + length)
-            return block[size:], begin, end
+        # The length in bytes, or the number of compressed parts.
         (count,) = np.frombuffer(take(self._data, begin, size)[0], self._word).tolist()
+        if self._coder is None:
+            block, end = take(self._data, begin, size + count)
+            return block[size:], begin, end
         header, at = take(self._data, begin, size * (3 + count))
         part, last, *lengths = np.frombuffer(header, self._word)[1:].tolist()
         sizes = [part] * (count - 1) + [last or part] * (count > 0)
@@ -251,11 +253,10 @@ class _VtuFile:
 
     def _encode(self, block: bytes, array: _Array) -> bytes:
         """Encode bytes in the same way as an array of the same length in the file."""
-        begin, raw = self._find_bytes(array)
-        code: Callable[[bytes], bytes] = bytes if raw else base64.b64encode
+        begin, take = self._find_bytes(array)
+        code: Callable[[bytes], bytes] = bytes if take is _take_raw else base64.b64encode
         if self._coder is None:
             return code(np.array([len(block)], dtype=self._word).tobytes() + block)
-        take = _take_raw if raw else _take_base64
         # Number of parts, their size, and the size of the last part if it is shorter.
         head = np.frombuffer(take(self._data, begin, 3 * self._word.itemsize)[0], self._word)
         count, size, _ = head.tolist()
@@ -263,15 +264,15 @@ class _VtuFile:
         header = np.concatenate([head, np.array([len(part) for part in packed], dtype=self._word)])
         return code(header.astype(self._word).tobytes()) + code(b"".join(packed))
 
-    def _find_bytes(self, array: _Array) -> tuple[int, bool]:
-        """Return the start of an array's bytes, and whether they are raw."""
+    def _find_bytes(self, array: _Array) -> tuple[int, _Take]:
+        """Return the start of an array's bytes, and the function that takes bytes from there."""
         if array.attributes.get("format") != "appended":
             inline = self._data[array.begin : array.end]
-            return array.begin + len(inline) - len(inline.lstrip()), False
+            return array.begin + len(inline) - len(inline.lstrip()), _take_base64
         begin = self._appended + int(array.attributes["offset"])
         if self._appended < 0 or begin > len(self._data):
             raise ValueError("an array refers to appended data that do not exist")
-        return begin, self._raw
+        return begin, self._take_appended
 
 
 def _take_raw(data: bytes, begin: int, length: int) -> tuple[bytes, int]:

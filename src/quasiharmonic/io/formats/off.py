@@ -119,7 +119,7 @@ def _read_lines(
     V, corners, starts = array("d"), array("q"), array("q", [0])
     line = 0
     for line, text in lines:
-        try:
+        with report_damage(path, line=line):
             if len(V) < 3 * vertices:
                 tokens = text.split(None, 3)[:3]
                 if len(tokens) < 3:
@@ -130,10 +130,6 @@ def _read_lines(
                 raise MeshFileError(path, f"more follows the {faces} faces", line, "correct the counts")
             corners.extend(_ring(path, line, text, vertices))
             starts.append(len(corners))
-        except MeshFileError:
-            raise
-        except ValueError as error:
-            raise MeshFileError(path, str(error), line) from None
     if len(starts) <= faces:
         have = f"{len(V) // 3} of {vertices} vertices and {len(starts) - 1} of {faces} faces"
         raise MeshFileError(path, f"ends after {have}", remedy="it was cut off, or its counts are wrong")

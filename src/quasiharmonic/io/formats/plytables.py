@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,7 +82,7 @@ def parse_tables(data: bytes) -> PlyTables:
     if ending is None:
         raise ValueError("its header does not end")
     order, declared, remarks = _header(data[first.end() : ending.start()].split(newline))
-    reader = _TextReader(data[ending.end() :]) if order == "" else _BinaryReader(data, ending.end(), order)
+    reader = _PlyReader(data, ending.end(), order)
     return PlyTables(tuple(Element(name, rows, reader.columns(rows, of)) for name, rows, of in declared), remarks)
 
 
@@ -133,136 +132,84 @@ def _header(lines: list[bytes]) -> tuple[str, list[tuple[str, int, list[_Propert
     return order, declared, tuple(remarks)
 
 
-class _PlyReader(ABC):
-    """Reads the tables of a file one after another."""
+class _PlyReader:
+    """Reads the tables of a file one after another; the numbers of a text file as if they were stored as doubles."""
+
+    def __init__(self, data: bytes, at: int, order: str) -> None:
+        self._data, self._at, self._order, self._text = data, at, order, not order
+        if self._text:
+            text = data[at:]
+            if b"_" in text:
+                raise ValueError("it has an underscore in its numbers")
+            self._data, self._at = np.array(list(map(float, text.split())), dtype="<f8").tobytes(), 0
 
     def columns(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
         """Return the next table."""
         return self._read_at_once(rows, properties) or self._read_row_by_row(rows, properties)
 
-    @abstractmethod
-    def _read_at_once(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
-        """Return the next table if it can be read at once, else None."""
-
-    @abstractmethod
-    def _size(self, of: _Property) -> int:
-        """Return how many numbers of a property come next, 1 if it is no list, and go to the first of them."""
-
-    @abstractmethod
-    def _take(self, kind: str, count: int) -> Any:
-        """Return the next numbers as they are in the file."""
-
-    @abstractmethod
-    def _join(self, parts: list[Any], kind: str) -> NDArray[Any]:
-        """Return the numbers of several results of `_take`."""
-
-    def _read_row_by_row(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
-        """Return the next table, read row by row."""
-        parts: list[list[Any]] = [[] for _ in properties]
-        sizes: list[list[int]] = [[] for _ in properties]
-        for _ in range(rows):
-            for of, numbers, lengths in zip(properties, parts, sizes, strict=True):
-                lengths.append(self._size(of))
-                numbers.append(self._take(of.kind, lengths[-1]))
-        return tuple(
-            Column(
-                of.name, self._join(numbers, of.kind), None if of.count is None else np.array(lengths, dtype=np.int64)
-            )
-            for of, numbers, lengths in zip(properties, parts, sizes, strict=True)
-        )
-
-
-class _BinaryReader(_PlyReader):
-    """Reads the tables of a binary file."""
-
-    def __init__(self, data: bytes, at: int, order: str) -> None:
-        self._data, self._at, self._order = data, at, order
-
     def _read_at_once(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
         """Return the next table if all its lists are as long as those of its first row, else None."""
-        sizes = self._first_sizes(properties) if rows else [0] * len(properties)
+        begin, sizes = self._at, []
         fields: list[Any] = []
-        for i, (of, size) in enumerate(zip(properties, sizes, strict=True)):
+        for i, of in enumerate(properties):
+            sizes.append(self._size(of) if rows else 0)
+            self._take(of.kind, sizes[-1])
             if of.count is not None:
-                fields.append((f"n{i}", self._order + of.count))
-            fields.append((f"v{i}", self._order + of.kind, () if of.count is None else (size,)))
+                fields.append((f"n{i}", self._stored(of.count)))
+            fields.append((f"v{i}", self._stored(of.kind), () if of.count is None else (sizes[-1],)))
+        self._at = begin
         dtype = np.dtype(fields)
-        if rows * dtype.itemsize > len(self._data) - self._at:
+        if rows * dtype.itemsize > len(self._data) - begin:
             return None
-        table = np.frombuffer(self._data, dtype, count=rows, offset=self._at)
+        table = np.frombuffer(self._data, dtype, count=rows, offset=begin)
         columns = []
         for i, (of, size) in enumerate(zip(properties, sizes, strict=True)):
             if of.count is not None and (table[f"n{i}"] != size).any():
                 return None
             lists = None if of.count is None else np.full(rows, size)
-            columns.append(Column(of.name, table[f"v{i}"].astype(of.kind).ravel(), lists))
+            columns.append(Column(of.name, self._convert(table[f"v{i}"], of.kind).ravel(), lists))
         self._at += rows * dtype.itemsize
         return tuple(columns)
 
-    def _first_sizes(self, properties: list[_Property]) -> list[int]:
-        """Return how many numbers of each property are in the next row, without reading past it."""
-        begin, sizes = self._at, []
-        for of in properties:
-            sizes.append(self._size(of))
-            self._at += sizes[-1] * np.dtype(of.kind).itemsize
-        self._at = begin
-        return sizes
+    def _read_row_by_row(self, rows: int, properties: list[_Property]) -> tuple[Column, ...]:
+        """Return the next table, read row by row."""
+        parts: list[list[bytes]] = [[] for _ in properties]
+        sizes: list[list[int]] = [[] for _ in properties]
+        for _ in range(rows):
+            for of, numbers, lengths in zip(properties, parts, sizes, strict=True):
+                lengths.append(self._size(of))
+                numbers.append(self._take(of.kind, lengths[-1]))
+        columns = []
+        for of, numbers, lengths in zip(properties, parts, sizes, strict=True):
+            values = self._convert(np.frombuffer(b"".join(numbers), self._stored(of.kind)), of.kind)
+            columns.append(Column(of.name, values, None if of.count is None else np.array(lengths, dtype=np.int64)))
+        return tuple(columns)
 
     def _size(self, of: _Property) -> int:
+        """Return how many numbers of a property come next, 1 if it is no list, and go to the first of them."""
         if of.count is None:
             return 1
-        count = self._take(of.count, 1)
-        size = int.from_bytes(count, "little" if self._order == "<" else "big", signed=of.count[0] == "i")
+        stored = self._take(of.count, 1)
+        if self._text:
+            size = int(_convert(np.frombuffer(stored), of.count)[0])
+        else:
+            size = int.from_bytes(stored, "little" if self._order == "<" else "big", signed=of.count[0] == "i")
         if size < 0 or size > len(self._data):
             raise ValueError(f"it has a list of {size} numbers")
         return size
 
     def _take(self, kind: str, count: int) -> bytes:
-        begin, self._at = self._at, self._at + count * np.dtype(kind).itemsize
+        """Return the bytes of the next numbers of a type."""
+        begin, self._at = self._at, self._at + count * (8 if self._text else int(kind[1]))
         check_end(self._at, len(self._data))
         return self._data[begin : self._at]
 
-    def _join(self, parts: list[bytes], kind: str) -> NDArray[Any]:
-        return np.frombuffer(b"".join(parts), self._order + kind).astype(kind)
+    def _stored(self, kind: str) -> str:
+        """Return the type in which numbers of a type are stored."""
+        return "<f8" if self._text else self._order + kind
 
-
-class _TextReader(_PlyReader):
-    """Reads the tables of a text file."""
-
-    def __init__(self, text: bytes) -> None:
-        if b"_" in text:
-            raise ValueError("it has an underscore in its numbers")
-        self._numbers = np.array(list(map(float, text.split())), dtype=np.float64)
-        self._at = 0
-
-    def _read_at_once(self, rows: int, properties: list[_Property]) -> tuple[Column, ...] | None:
-        """Return the next table if it has no lists, or a single column of lists that are all as long as the first."""
-        if all(of.count is None for of in properties):
-            numbers = self._take("f8", rows * len(properties)).reshape(rows, -1)
-            return tuple(Column(of.name, _convert(numbers[:, i], of.kind)) for i, of in enumerate(properties))
-        if not rows or len(properties) > 1 or self._at == len(self._numbers):
-            return None
-        (of,), size = properties, self._numbers[self._at]
-        table = self._numbers[self._at : self._at + rows * (int(size) + 1)] if 0 <= size < len(self._numbers) else None
-        if table is None or table.size < rows * (int(size) + 1) or (table[:: int(size) + 1] != size).any():
-            return None
-        self._at += table.size
-        lists = table.reshape(rows, -1)
-        return (Column(of.name, _convert(lists[:, 1:].ravel(), of.kind), _convert(lists[:, 0], "i4").astype(np.int64)),)
-
-    def _size(self, of: _Property) -> int:
-        size = 1 if of.count is None else int(_convert(self._take(of.count, 1), of.count)[0])
-        if size < 0:
-            raise ValueError(f"it has a list of {size} numbers")
-        return size
-
-    def _take(self, kind: str, count: int) -> NDArray[np.float64]:
-        check_end(self._at + count, len(self._numbers))
-        self._at += count
-        return self._numbers[self._at - count : self._at]
-
-    def _join(self, parts: list[NDArray[np.float64]], kind: str) -> NDArray[Any]:
-        return _convert(np.concatenate([np.empty(0), *parts]), kind)
+    def _convert(self, numbers: NDArray[Any], kind: str) -> NDArray[Any]:
+        return _convert(numbers, kind) if self._text else numbers.astype(kind)
 
 
 def _convert(numbers: NDArray[np.float64], kind: str) -> NDArray[Any]:

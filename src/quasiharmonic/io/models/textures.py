@@ -6,15 +6,15 @@ The texture covers the unit square, v upwards, and repeats beyond it, as in ever
 from __future__ import annotations
 
 import os
-import struct
-import zlib
 from dataclasses import dataclass
+from io import BytesIO
 from typing import NamedTuple
 
 import numpy as np
 
 from quasiharmonic.io.errors import MeshFileError
 from quasiharmonic.io.untrusted import read_bytes
+from quasiharmonic.util.hints import explain_missing
 
 _IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": ("image/png", ".png"), b"\xff\xd8\xff": ("image/jpeg", ".jpg")}
 
@@ -106,17 +106,11 @@ def texture_of(data: bytes) -> Texture | None:
 
 def checkerboard() -> Texture:
     """Return a checkerboard texture that repeats without seams."""
+    with explain_missing("pictures need Pillow", "pillow"):
+        from PIL import Image
+
     dark = np.indices((_BOARD.squares, _BOARD.squares)).sum(axis=0) % 2 == 1
     squares = np.where(dark[..., None], _BOARD.dark, _BOARD.light).astype(np.uint8)
     pixels = squares.repeat(_BOARD.pixels, axis=0).repeat(_BOARD.pixels, axis=1)
-    side = _BOARD.squares * _BOARD.pixels
-    # Each line starts with a filter byte; 0 means unfiltered.
-    lines = np.concatenate([np.zeros((side, 1), dtype=np.uint8), pixels.reshape(side, -1)], axis=1)
-    head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
-    parts = (b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b"")
-    (start, kind), *_ = _IMAGE_TYPES.items()
-    return Texture(start + b"".join(_chunk(*part) for part in parts), *kind)
-
-
-def _chunk(name: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    Image.fromarray(pixels).save(file := BytesIO(), "PNG", optimize=True)
+    return Texture(file.getvalue(), "image/png", ".png")

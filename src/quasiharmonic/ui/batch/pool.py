@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -119,11 +119,8 @@ def solve_in_processes(groups: Iterator[list[ProblemFiles]], orders: Orders, job
     The problems of a group may be solved together. A problem whose process ran out of memory is solved again in a new
     process while no other is solved; only the result of that is yielded.
     """
-    workers = _WorkerPool(groups, orders, jobs)
-    try:
+    with closing(_WorkerPool(groups, orders, jobs)) as workers:
         yield from workers.finished()
-    finally:
-        workers.close()
 
 
 class _WorkerPool:

@@ -120,19 +120,12 @@ def _check_sample(sample: Sample, seen: set[str]) -> None:
         sample.files.pop(second, None)
     meshes = [extension for extension in sample.files if _is_mesh(extension)]
     if sample.key in seen:
-        sample.key, sample.error = (
-            _find_unused_key(sample.key, seen),
-            f"the name {sample.key} is used twice in the archive",
-        )
+        sample.error = f"the name {sample.key} is used twice in the archive"
+        sample.key = next(name for number in count(2) if (name := f"{sample.key} ({number})") not in seen)
     elif not meshes:
         sample.error = "it has no mesh"
     elif len(meshes) > 1:
         sample.error = f"it has several meshes: {', '.join(meshes)} (the name of a problem ends at the first dot)"
-
-
-def _find_unused_key(key: str, seen: set[str]) -> str:
-    """Return the name with the first number that makes it new."""
-    return next(name for number in count(2) if (name := f"{key} ({number})") not in seen)
 
 
 def _is_mesh(extension: str) -> bool:

@@ -191,15 +191,8 @@ class Settings(DescentOptions):
 
         This requires QDLDL, whose result for a mesh does not depend on the other meshes of the group.
         """
-        alone = (
-            self.flatten
-            or self.unwrap is not None
-            or self.pack
-            or self.cut
-            or self.refine
-            or self.slide
-            or self.polish is not None
-        )
+        alone = self.flatten or self.pack or self.cut or self.refine or self.slide
+        alone = alone or self.unwrap is not None or self.polish is not None
         by_qdldl = self.linear_solver in ("auto", "qdldl") and "qdldl" in available()
         return by_qdldl and not alone and self.reference in (None, "equilateral")
 

@@ -7,7 +7,6 @@ with a record, written next to the map before the answer is sent, or with the de
 
 from __future__ import annotations
 
-import faulthandler
 import json
 import os
 import signal
@@ -41,8 +40,8 @@ from quasiharmonic.targets.boundary.fitted_problems import FittedProblem
 from quasiharmonic.ui.batch import groups, island_problems, memory, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
+from quasiharmonic.ui.worker_pipes import open_pipes
 from quasiharmonic.util.options import PolishOptions
-from quasiharmonic.util.threads import detach_input
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"
@@ -56,23 +55,13 @@ Tell = Callable[[dict[str, Any]], None]
 
 def serve() -> None:
     """Solve the jobs from standard input until it is closed; then exit at once."""
-    # Ctrl-C reaches the whole process group; the parent decides when this process ends.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    faulthandler.enable(all_threads=False)
-    # Redirect standard output to standard error, so that output of libraries does not mix with the answers.
-    answers = os.fdopen(os.dup(1), "w", encoding="ascii")
-    os.dup2(2, 1)
+    source, send = open_pipes()
 
     def tell(message: dict[str, Any]) -> None:
-        try:
-            answers.write(json.dumps(message, allow_nan=False) + "\n")
-            answers.flush()
-        except OSError:
-            # The supervisor is gone. This is not an error of the problem and must not get into its record.
-            os._exit(0)
+        send(json.dumps(message, allow_nan=False).encode() + b"\n")
 
     jobs: SimpleQueue[bytes] = SimpleQueue()
-    threading.Thread(target=_listen, args=(detach_input(), jobs), daemon=True).start()
+    threading.Thread(target=_listen, args=(source, jobs), daemon=True).start()
     tell({READY: True})
     while True:
         job = json.loads(jobs.get())

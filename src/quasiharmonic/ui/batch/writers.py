@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import BinaryIO, NamedTuple
 
 from quasiharmonic.io.atomic import writing
 from quasiharmonic.ui.batch import places, records
@@ -36,8 +36,8 @@ from quasiharmonic.ui.batch.supervisor import is_valid
 _KEPT = "key", "outcome", "time_limit", "memory_limit", "seconds"
 
 
-class ResultWriter(Protocol):
-    """Writer of the results of the problems that one reader reads.
+class ResultWriter:
+    """Writer of the results of the problems that one reader reads. Here most methods do nothing.
 
     The methods are called in this order:
 
@@ -55,28 +55,32 @@ class ResultWriter(Protocol):
 
     def find_finished(self) -> Counter[str] | None:
         """Return the numbers of outcomes if all problems are known to be finished, before they are read; else None."""
+        return None
 
     def open(self) -> None:
         """Prepare for results."""
 
     def resume(self, files: ProblemFiles) -> Record | None:
         """Note the next problem; return its record of an earlier run, if the supervisor does not read this itself."""
+        return None
 
     def add(self, files: ProblemFiles, record: Record | None) -> None:
         """Keep the results of a problem; it has no record if that could not be written."""
 
     def fail(self, error: OSError) -> None:
         """Note that the problems cannot be read; raise the error if the run cannot continue."""
+        raise error
 
     def finish(self) -> None:
         """Complete the results after the last problem."""
 
     def records(self) -> Iterator[Record]:
         """Yield the records of the finished problems, in order."""
+        raise NotImplementedError
 
 
-class FolderWriter:
-    """Results in the folders of the problems, where workers write them, so that most methods do nothing.
+class FolderWriter(ResultWriter):
+    """Results in the folders of the problems, where workers write them.
 
     Parameters
     ----------
@@ -89,24 +93,6 @@ class FolderWriter:
     def __init__(self, reader: FolderReader, orders: Orders) -> None:
         self._reader, self._orders = reader, orders
 
-    def find_finished(self) -> Counter[str] | None:
-        return None
-
-    def open(self) -> None:
-        pass
-
-    def resume(self, files: ProblemFiles) -> Record | None:
-        return None
-
-    def add(self, files: ProblemFiles, record: Record | None) -> None:
-        pass
-
-    def fail(self, error: OSError) -> None:
-        raise error
-
-    def finish(self) -> None:
-        pass
-
     def records(self) -> Iterator[Record]:
         for files in self._reader.problems(self._orders):
             record = records.read_record(self._orders.folder(files))
@@ -114,7 +100,7 @@ class FolderWriter:
                 yield record
 
 
-class ArchiveWriter:
+class ArchiveWriter(ResultWriter):
     """Results in an archive, which is written from a journal when all problems are finished.
 
     Parameters

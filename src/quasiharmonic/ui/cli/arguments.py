@@ -83,11 +83,16 @@ def add_options(parser: argparse._ActionsContainer, *shared: str, **own: Option)
 
 
 def add_files(
-    parser: argparse.ArgumentParser, source: str, output: str, *, metavar: tuple[str, str] = ("INPUT", "OUTPUT")
+    parser: argparse.ArgumentParser,
+    source: str,
+    output: str | None = None,
+    *,
+    metavar: tuple[str, ...] = ("INPUT", "OUTPUT"),
 ) -> None:
-    """Add the input, and ``--output``, with these help texts and names."""
+    """Add the input, and ``--output`` if it is given, with these help texts and names."""
     parser.add_argument("input", type=Path, metavar=metavar[0], help=source)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar=metavar[1], help=output)
+    if output is not None:
+        parser.add_argument("-o", "--output", type=Path, required=True, metavar=metavar[1], help=output)
 
 
 def pick(given: argparse.Namespace, *names: str) -> dict[str, Any]:
@@ -129,10 +134,8 @@ def count(text: str) -> int:
 
 def byte_count(text: str) -> int:
     """Convert a size such as 800M or 4G to bytes; for argparse."""
-    found = re.fullmatch(r"([0-9.]+)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
-    value = 0.0
-    if found is not None and found[1].count(".") < 2 and found[1] != ".":
-        value = float(found[1]) * 1024 ** " KMGT".index(found[2].upper() or " ")
+    found = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
+    value = 0.0 if found is None else float(found[1]) * 1024 ** " KMGT".index(found[2].upper() or " ")
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a size such as 800M or 4G")
     return int(value)

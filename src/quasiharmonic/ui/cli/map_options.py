@@ -162,16 +162,12 @@ def check_options(options: argparse.Namespace, mesh: MeshData, fixed: NDArray[np
             raise ValueError(f"--{option} applies only to an outline: give one by --to")
     if options.seams != "file":
         raise ValueError("without --to the targets and the seams are those of the input's vt: add --to")
-    if mesh.FT is None and fixed is None:
-        raise ValueError(
-            f"{mesh.source}: no face refers to texture coordinates (vt), so the boundary has no targets: "
-            "add them, or give an outline, as in --to disk"
-        )
     if mesh.FT is None:
-        raise ValueError(
-            f"{mesh.source}: no face refers to texture coordinates (vt), so the fixed vertices have no targets: "
-            "export it with uv coordinates (in OBJ: vt lines and faces like 1/1 2/2 3/3)"
-        )
+        lacking = "boundary has no targets: add them, or give an outline, as in --to disk"
+        if fixed is not None:
+            remedy = "export it with uv coordinates (in OBJ: vt lines and faces like 1/1 2/2 3/3)"
+            lacking = f"fixed vertices have no targets: {remedy}"
+        raise ValueError(f"{mesh.source}: no face refers to texture coordinates (vt), so the {lacking}")
 
 
 def make_problem(

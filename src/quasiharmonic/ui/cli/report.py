@@ -44,12 +44,9 @@ def use_options(parser: argparse.ArgumentParser, command: str) -> None:
 def list_options(parser: argparse.ArgumentParser, command: str) -> dict[str, str]:
     """Return the options of a subcommand by the names of their values."""
     (subcommands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
-    options = {}
-    for action in subcommands.choices[command]._actions:
-        long = [option for option in action.option_strings if option.startswith("--")]
-        if long:
-            options[action.dest] = long[0]
-    return options
+    actions = subcommands.choices[command]._actions
+    long = {one.dest: [option for option in one.option_strings if option.startswith("--")] for one in actions}
+    return {name: options[0] for name, options in long.items() if options}
 
 
 def in_options(text: str) -> str:

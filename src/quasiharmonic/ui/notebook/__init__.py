@@ -5,20 +5,12 @@ The package builds on `ui.studio`. Start reading in `widget`.
 
 from __future__ import annotations
 
+import lazy_loader  # type: ignore[import-untyped]
+
 # Same meaning as in `typing`, without the import.
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
-    from typing import Any
+    from quasiharmonic.ui.notebook.widget import MapWidget as MapWidget
 
-    from quasiharmonic.ui.notebook.widget import MapWidget
-
-__all__ = ["MapWidget"]
-
-
-def __getattr__(name: str) -> Any:
-    if name != "MapWidget":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from quasiharmonic.ui.notebook.widget import MapWidget
-
-    return MapWidget
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submod_attrs={"widget": ["MapWidget"]})

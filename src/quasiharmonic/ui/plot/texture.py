@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -101,9 +101,9 @@ def plot_texture(
     seen = view(rest, F)
     figure = new_figure((9.6, 4.8))
     surface, plane = panels(figure, 2)
-    _show_render(surface, seen.points, render(seen.points, seen.depth, F, board, color, inverted, seen.light))
+    _show_render(surface, seen.points, seen.depth, F, board, color, inverted, seen.light)
     caption(surface, f"surface: {len(F):,} triangles")
-    _show_render(plane, board, render(board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6)))
+    _show_render(plane, board, np.zeros(len(uv)), F, board, color, inverted, np.full(len(F), 0.6))
     draw_edges(plane, board, boundary_edges(F, len(board)))
     verdict(plane, "map", len(inverted))
     return figure
@@ -138,10 +138,10 @@ def save_texture_figure(
     save_picture(path, plot_texture(V, F, uv, squares=squares, texture=texture))
 
 
-def _show_render(ax: Axes, points: FloatArray, image: FloatArray) -> None:
-    """Show a rendered image in axes, in the coordinates of its points."""
+def _show_render(ax: Axes, points: FloatArray, *scene: Any) -> None:
+    """Show what `render` returns for points and the rest of its arguments in axes, in the coordinates of the points."""
     low, high = _window(points)
-    ax.imshow(image, interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
+    ax.imshow(render(points, *scene), interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
     ax.set_axis_off()
 
 
@@ -302,11 +302,7 @@ def plot_unwrap(V: ArrayLike, F: ArrayLike, uv: ArrayLike) -> Figure:
 
     paint_map(layout, F, uv, colormaps["viridis"](chart[F[:, 0]] * 0.618 % 1)[:, :3], bad)
     verdict(layout, f"{len(first)} charts" if len(first) > 1 else "1 chart", len(bad))
-    _show_render(
-        board,
-        seen.points,
-        render(seen.points, seen.depth, F, uv * _SQUARES, _checkerboard_color, bad, seen.light),
-    )
+    _show_render(board, seen.points, seen.depth, F, uv * _SQUARES, _checkerboard_color, bad, seen.light)
     caption(board, "checkerboard")
     density = np.sqrt(np.where(found.area_ratio > 0, found.area_ratio, np.nan))
     for ax, name, measure, values, left in (

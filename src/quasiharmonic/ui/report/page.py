@@ -180,10 +180,7 @@ def _describe_unwraps(run: BatchRun) -> str:
     lines = [
         (
             escape_text(row["problem"]),
-            *(
-                number(np.nan if row.get(name) is None else float(row[name]))
-                for name in ("charts", "seam_length", "stretch", "utilisation")
-            ),
+            *(_value(row, name) for name in ("charts", "seam_length", "stretch", "utilisation")),
             escape_text(row.get("cleaned") or "–"),
         )
         for row in rows
@@ -315,9 +312,14 @@ def _failures(run: BatchRun, draw: Draw) -> str:
 
 
 def _line(row: Record) -> tuple[str, ...]:
-    sizes = (row.get(column) for column in ("triangles", "seconds"))
-    triangles, seconds = (float("nan") if value is None else float(value) for value in sizes)
-    return escape_text(row["problem"]), number(triangles), number(seconds, "s"), escape_text(_reason(row))
+    sizes = _value(row, "triangles"), _value(row, "seconds", "s")
+    return escape_text(row["problem"]), *sizes, escape_text(_reason(row))
+
+
+def _value(row: Record, column: str, unit: str = "") -> str:
+    """Format a number of a record; a dash if there is none."""
+    value = row.get(column)
+    return number(float("nan") if value is None else float(value), unit)
 
 
 def _figure(title: str, drawing: str, legend: Iterable[tuple[str, str]], caption: str) -> str:

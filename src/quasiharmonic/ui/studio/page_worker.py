@@ -6,9 +6,7 @@ process crashes, the server and the other pages continue.
 
 from __future__ import annotations
 
-import faulthandler
 import os
-import signal
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -19,7 +17,7 @@ from quasiharmonic.ui.studio.history import Storage
 from quasiharmonic.ui.studio.protocol import Array, MessageFrame, decode, encode
 from quasiharmonic.ui.studio.session import Session
 from quasiharmonic.ui.studio.surface import read_sheet
-from quasiharmonic.util.threads import detach_input
+from quasiharmonic.ui.worker_pipes import open_pipes
 
 #: Maximum total size of waiting messages, bytes.
 MAX_WAITING = 256 << 20
@@ -34,23 +32,13 @@ def serve(source: str, folder: str = "") -> None:
 
     The session is stored in ``folder``. If a stored session is there, it continues.
     """
-    # Ctrl-C reaches the whole process group; the server decides when this process ends.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    faulthandler.enable(all_threads=False)
-    answers = os.fdopen(os.dup(1), "wb")
-    # Redirect standard output to standard error, so that output of libraries does not mix with the messages.
-    os.dup2(2, 1)
+    requests, send = open_pipes()
 
     def tell(header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
         message = encode(header, arrays)
-        try:
-            answers.write(len(message).to_bytes(8, "little") + message)
-            answers.flush()
-        except OSError:
-            # The server is gone.
-            os._exit(0)
+        send(len(message).to_bytes(8, "little") + message)
 
-    inbox = Inbox(detach_input())
+    inbox = Inbox(requests)
     session = Session(tell, inbox.waiting, Storage(Path(folder)) if folder else None, inbox.stops)
     try:
         if session.restore():

@@ -10,6 +10,7 @@ import base64
 import binascii
 import json
 import os
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,13 +143,7 @@ class Document:
 
     def _count_references(self, view: int) -> int:
         """Return the number of references to a view."""
-
-        def count(node: object) -> int:
-            if isinstance(node, dict):
-                return (node.get("bufferView") == view) + sum(map(count, node.values()))
-            return sum(map(count, node)) if isinstance(node, list) else 0
-
-        return count(self.tree)
+        return sum(1 for _ in find_objects(self.tree, lambda node: node.get("bufferView") == view))
 
     def _rows(self, where: dict[str, Any], count: int, kind: np.dtype[Any], width: int) -> NDArray[Any]:
         """Return a copy of rows of numbers in a view."""
@@ -159,6 +154,19 @@ class Document:
             raise ValueError(f"buffer view {index} is too short for its numbers")
         found = np.ndarray((count, row), np.uint8, view, begin if count else 0, (stride, 1))
         return np.array(found).view(kind).reshape(count, width)
+
+
+def find_objects(node: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> Iterator[dict[str, Any]]:
+    """Yield the wanted objects in a part of a document, at any depth, except in extras."""
+    if isinstance(node, list):
+        for part in node:
+            yield from find_objects(part, is_wanted)
+    elif isinstance(node, dict):
+        if is_wanted(node):
+            yield node
+        for key, part in node.items():
+            if key != "extras":
+                yield from find_objects(part, is_wanted)
 
 
 def load(path: str | os.PathLike[str]) -> Document:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.io.errors import printable_path
-from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, read_uri, whole
+from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, find_objects, read_uri, whole
 from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, read_corners
 from quasiharmonic.io.models.appearance import Appearance, ImageUse, NamedImage, Role, SurfaceMaterial, Wrap
 from quasiharmonic.io.models.textures import MaterialTextures, Texture
@@ -52,6 +52,15 @@ def gltf_appearance(carried: CarriedGltf) -> Appearance:
     if "KHR_materials_variants" in carried.document.tree.get("extensions", {}):
         reader.problems.append("variants of materials are not baked, and keep their textures")
     return Appearance(materials, of_triangle, coordinates, colours, tuple(dict.fromkeys(reader.problems)))
+
+
+def first_colour_image(carried: CarriedGltf) -> bytes | None:
+    """Return the image of the first material that has a base colour texture; None if it cannot be read."""
+    reader = _MaterialReader(carried.document, carried.folder)
+    for k in range(len(carried.document.tree.get("materials", []))):
+        if (use := reader.read(k).textures.get("colour")) is not None:
+            return use.image.data
+    return None
 
 
 class _MaterialReader:
@@ -265,16 +274,3 @@ def _keep_used(tree: dict[str, Any], name: str, used: set[int]) -> dict[int, int
     kept = sorted(used)
     tree[name] = [tree[name][k] for k in kept]
     return {k: i for i, k in enumerate(kept)}
-
-
-def find_objects(node: Any, is_wanted: Callable[[dict[str, Any]], bool]) -> Iterator[dict[str, Any]]:
-    """Yield the wanted objects in a part of a document, at any depth, except in extras."""
-    if isinstance(node, list):
-        for part in node:
-            yield from find_objects(part, is_wanted)
-    elif isinstance(node, dict):
-        if is_wanted(node):
-            yield node
-        for key, part in node.items():
-            if key != "extras":
-                yield from find_objects(part, is_wanted)

@@ -67,18 +67,16 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
     if apart < len(mesh.V):
         same = count_of("vertex", "vertices", len(mesh.V) - apart)
         lost.append(f"{same} at positions that coincide with others in single precision")
-    if mesh.polygons is not None:
-        lost.append("polygons, which are written as triangles")
-    if mesh.extra is not None and colours_of(mesh) is None:
-        lost.append("data after the coordinates of some vertices, unless they are colours")
-    if mesh.FN is not None and normals_of(mesh) is None:
-        lost.append("normals, because some faces have none")
     words = {line.split(None, 1)[0] for line in mesh.statements.splitlines() if line.split()}
-    if words & {b"o", b"g", b"s"}:
-        lost.append("groups")
-    if b"mtllib" in words and mesh.texture is None:
-        lost.append("the appearance of materials")
-    return lost
+    other_extra = mesh.extra is not None and colours_of(mesh) is None
+    faults = {
+        "polygons, which are written as triangles": mesh.polygons is not None,
+        "data after the coordinates of some vertices, unless they are colours": other_extra,
+        "normals, because some faces have none": mesh.FN is not None and normals_of(mesh) is None,
+        "groups": words & {b"o", b"g", b"s"},
+        "the appearance of materials": b"mtllib" in words and mesh.texture is None,
+    }
+    return lost + [what for what, holds in faults.items() if holds]
 
 
 def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:

@@ -122,14 +122,11 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         pack=flag("with --to and --flatten: pack the islands into the unit square by their shapes"),
         energy=choice(FLATTENED, "energy that --flatten lowers (default: symmetric-dirichlet)"),
         polish=choice(ENERGIES, "lower the distortion of each injective map: %(choices)s", metavar="ENERGY"),
-        slide=flag(
-            "let boundary vertices slide along the outline while --polish lowers distortion; corners stay fixed"
-        ),
     )
     of_outlines = {
         name: SHARED[name] | {"help": f"for --to: {SHARED[name]['help']}"} for name in ("corners", "corner_angle")
     }
-    add_options(solver, "font", **of_outlines)
+    add_options(solver, "slide", "font", **of_outlines)
     add_options(solver, "pieces", "refine", strategy=SHARED["strategy"] | {"default": None})
     add_options(solver, **declare_options(DescentOptions))
     add_options(solver, "reference", "max_iterations", "linear_solver")
@@ -182,8 +179,7 @@ def run(options: argparse.Namespace) -> int:
     records = places.join(options.output, table_name(read_shard(options.shard), options.table))
     with report.after_writing(records):
         print(_account(progress, wanted, records), flush=True)
-    if options.report:
-        with report.after_writing(records):
+        if options.report:
             _write_report(options)
     return 0 if progress.solved == progress.total else 1
 

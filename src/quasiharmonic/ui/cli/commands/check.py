@@ -16,11 +16,10 @@ read.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report, written_map
-from quasiharmonic.ui.cli.arguments import add_options, choice, file, flag, weld
+from quasiharmonic.ui.cli.arguments import add_files, add_options, choice, file, flag, weld
 
 if TYPE_CHECKING:
     import numpy as np
@@ -53,12 +52,11 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser.add_argument(
-        "input",
-        type=Path,
-        metavar="FILE",
-        help=f"{format_names('read')} file, a finite-element mesh ({format_names('read_elements')}), or a folder with "
+    add_files(
+        parser,
+        f"{format_names('read')} file, a finite-element mesh ({format_names('read_elements')}), or a folder with "
         "input.obj (or .ply) and handles.txt",
+        metavar=("FILE",),
     )
     add_options(
         parser, fixed=file("file of fixed vertices for the obstructions, 0-based, one per line (default: the boundary)")

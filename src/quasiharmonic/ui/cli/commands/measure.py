@@ -13,11 +13,10 @@ Exit status: 0 measured; 2 wrong input or call, nothing written; 3 exported, but
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from quasiharmonic.ui.cli import finite_elements, pipeline, report
-from quasiharmonic.ui.cli.arguments import add_options, file, flag, set_default
+from quasiharmonic.ui.cli.arguments import add_files, add_options, file, flag, set_default
 
 if TYPE_CHECKING:
     from quasiharmonic.energies.measures import Distortion
@@ -27,9 +26,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser.add_argument(
-        "input", type=Path, metavar="FILE", help=f"{format_names('write_map')} file with a map, injective or not"
-    )
+    add_files(parser, f"{format_names('write_map')} file with a map, injective or not", metavar=("FILE",))
     add_options(
         parser,
         export=file(f"write every measure of every triangle as {format_names('encode_values')}"),

@@ -17,7 +17,7 @@ import argparse
 from pathlib import Path
 
 from quasiharmonic.ui.cli import finite_elements, report, written_map
-from quasiharmonic.ui.cli.arguments import MEASURES, add_options, choice, set_default, text
+from quasiharmonic.ui.cli.arguments import MEASURES, add_files, add_options, choice, set_default, text
 from quasiharmonic.ui.cli.pipeline import CHECKERBOARD
 
 
@@ -25,15 +25,12 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     from quasiharmonic.io.registry import format_names
 
-    parser.add_argument(
-        "input",
-        type=Path,
-        metavar="FILE",
-        help=f"{format_names('write_map')} file with a map, a "
-        "finite-element mesh, or a displacement field (.npy, .nii, .nii.gz, .mha, .nrrd)",
-    )
-    parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="IMAGE", help="image to write: .png, .svg or .pdf"
+    add_files(
+        parser,
+        f"{format_names('write_map')} file with a map, a finite-element mesh, or a displacement field (.npy, .nii, "
+        ".nii.gz, .mha, .nrrd)",
+        "image to write: .png, .svg or .pdf",
+        metavar=("FILE", "IMAGE"),
     )
     add_options(
         parser,

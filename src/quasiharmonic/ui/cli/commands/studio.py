@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from quasiharmonic.util.hints import with_extra
+from quasiharmonic.util.hints import explain_missing
 
 
 def declare_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,12 +40,9 @@ def run(options: argparse.Namespace) -> int:
     import webbrowser
     from contextlib import suppress
 
-    try:
-        from quasiharmonic.ui.studio.server import Studio
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] != "websockets":
-            raise
-        raise ImportError(f"the page needs the package websockets: pip install {with_extra('studio')}") from error
+    with explain_missing("the page needs the package websockets", extra="studio"):
+        import websockets.asyncio.server  # noqa: F401
+    from quasiharmonic.ui.studio.server import Studio
 
     source = ""
     if options.input is not None:

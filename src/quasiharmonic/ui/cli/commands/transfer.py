@@ -103,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
     used = target.origin[:n] >= 0
     found = source.inverse.locate(target.inverse.uv[:n])
     outside = int((used & ~found.found).sum())
-    written: list[str] = []
+    written = [str(path) for path in outputs.values()]
     facts: dict[str, Any] = {
         "bijective": True,
         "onto": between.onto,
@@ -129,13 +129,10 @@ def run(options: argparse.Namespace) -> int:
         moved = replace(with_map, V=V, normals=b"", FN=None)
         pipeline.tell_losses(options.output, moved)
         io.write_mapped(options.output, moved)
-        written.append(str(options.output))
     if values is not None:
         _write_table(options.values[1], values)
-        written.append(str(options.values[1]))
     if marks is not None:
         io.write_whole(options.landmarks[1], marks)
-        written.append(str(options.landmarks[1]))
 
     def describe() -> pipeline.Account:
         instead = "the nearest point of its boundary" if options.outside == "nearest" else "nan"

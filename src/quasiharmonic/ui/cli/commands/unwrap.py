@@ -173,6 +173,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
     given = pick(options, "resolution", "stack", "weld", *declare_options(UnwrapOptions))
     if options.symmetry == "none":
         given["symmetry"] = None
+    keeps = options.keep_seams or options.faces is not None
     with pipeline.show_work(options.input, _words) as show:
         result = unwrap(
             mesh.V,
@@ -185,11 +186,7 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             seams=_read_integers(options.seams, 2),
             no_seams=_read_integers(options.no_seams, 2),
             labels=_labels(mesh, options.labels),
-            uv=(
-                corner_positions(io.select_channel(mesh, options.seams_channel))
-                if options.keep_seams or options.faces
-                else None
-            ),
+            uv=corner_positions(io.select_channel(mesh, options.seams_channel)) if keeps else None,
             faces=_faces(mesh, options.faces),
             callback=_bound_memory(show, options.memory),
             **given,
