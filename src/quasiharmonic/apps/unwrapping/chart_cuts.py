@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import KEPT_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
-from quasiharmonic.geometry.mesh.topology import find_pairs, label_components
+from quasiharmonic.geometry.mesh.topology import find_pairs, group_by_label, label_components
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
 
@@ -235,8 +235,7 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     rest.eliminate_zeros()
     reached = mark(size, breadth_first_order(rest, size - 2, return_predecessors=False))
     side = reached[node[:k]]
-    line = mark(len(graph.ends), edge[side[first] != side[second]])
-    return line
+    return mark(len(graph.ends), edge[side[first] != side[second]])
 
 
 def group_undivided(F: IntArray, cost: FloatArray, least: float = UNDIVIDED_COST) -> IntArray:
@@ -263,8 +262,7 @@ def _open(chart: WorkingChart, cut: BoolArray) -> list[WorkingChart]:
     """Open a chart at sides (k, 3) of its triangles; return its parts, which keep the map."""
     split, component = fans(chart.F, cut)
     parts = []
-    for number in range(int(component.max()) + 1):
-        rows = np.flatnonzero(component == number)
+    for rows in group_by_label(component):
         own, corner = renumber(split[rows], chart.F[rows])
         origin = chart.F[rows].ravel()[corner]
         part = WorkingChart(chart.triangles[rows], chart.vertices[origin], chart.V[origin], own, chart.cost[rows])

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict, certify
-from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
+from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean, turn_corners
 from quasiharmonic.apps.unwrapping.layout import ChartLayout
 from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.geometry.exact import certificate
@@ -23,7 +23,7 @@ from quasiharmonic.geometry.exact.loops import LoopEdges, Obstacle
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_twins, group_by_label, label_components
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of, repeat_each
-from quasiharmonic.util.outcome import Verdict
+from quasiharmonic.util.outcome import Verdict, as_plain
 
 # Largest distance between the boxes of stacked charts, in sides of the texture. Congruent charts may differ by a share
 # of 1e-4 of their radius.
@@ -104,12 +104,9 @@ class UnwrapCertificate(Verdict):
         """Return the verdict for JSON."""
         return {
             **super().to_dict(),
-            "injective": self.injective,
-            "disjoint": self.disjoint,
+            **as_plain(self, "injective", "disjoint"),
             "not_bijective_charts": np.flatnonzero(~self.bijective_charts).tolist(),
-            "inverted": self.inverted.tolist(),
-            "degenerate": self.degenerate.tolist(),
-            "overlapping": self.overlapping.tolist(),
+            **as_plain(self, "inverted", "degenerate", "overlapping"),
             "clearance": self.clearance if np.isfinite(self.clearance) else None,
         }
 
@@ -279,7 +276,7 @@ def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tupl
     preferred = np.zeros(len(F), dtype=np.int64)
     preferred[cleaned.triangles] = np.where(cleaned.flipped, -1, 1)
     turned = _orient(G, len(keys), preferred[rows])
-    G[turned] = G[turned][:, (0, 2, 1)]
+    G = turn_corners(G, turned)
     points, uv = V[F[rows].ravel()[first]], places[pairs[keys] % len(places)]
     verdict = certify(SeamedMesh(points, G, G, uv))
     # A texture is mirrored if `unwrap` treated an inside-out model as turned outward.
@@ -346,5 +343,4 @@ def _orient(F: IntArray, n: int, preferred: IntArray) -> BoolArray:
     label = label_components(np.concatenate([one, one + 1]), np.concatenate([other, other ^ 1]), 2 * len(F))
     chart, odd = label[::2] // 2, label[::2] % 2 == 1
     votes = np.bincount(chart, np.where(odd, -preferred, preferred), len(F))
-    turned: BoolArray = (odd ^ (votes < 0)[chart]) & (label[::2] != label[1::2])
-    return turned
+    return np.asarray((odd ^ (votes < 0)[chart]) & (label[::2] != label[1::2]))

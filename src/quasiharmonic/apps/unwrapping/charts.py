@@ -47,7 +47,6 @@ def find_charts(
     choose: LayoutChoice | None = None,
     mirror: Mirror | None = None,
     draft: Draft | None = None,
-    seed: int = 0,
     callback: Callable[[str, int, int], object] | None = None,
     jobs: int | None = None,
 ) -> list[Chart]:
@@ -85,8 +84,6 @@ def find_charts(
         crosses the plane, or the seams there would grow by more than a quarter.
     draft : Draft, optional
         Gets the charts so far, in case that a time limit ends the search.
-    seed : int
-        Unused: the search has no random choices.
     callback : callable, optional
         Called with the phase, the number of finished parts and the number of all parts; may raise an exception.
     jobs : int, optional
@@ -184,15 +181,12 @@ def _develop(
         workers.check_wanted,
         None if mirror is None else mirror.select(rows),
     )
-    if max_charts is None or _count_components(F[rows[~developed]]) <= max_charts - len(charts) - len(more):
+    if max_charts is None or int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1 <= max_charts - len(charts) - len(
+        more
+    ):
         charts += [replace(chart, triangles=rows[chart.triangles]) for chart in more]
         mask[rows[developed]] = True
     return mask, charts
-
-
-def _count_components(F: IntArray) -> int:
-    """Number of the surfaces that triangles (k, 3) form."""
-    return int(fans(F)[1].max(initial=-1)) + 1
 
 
 def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, list[Chart]]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import convex_hull, find_smallest_box
-from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart, cut_out_chart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, ahead, find_hinges
 from quasiharmonic.apps.unwrapping.layout import MAX_COMPARED, LayoutChoice
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
@@ -22,7 +22,7 @@ from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import SAME, meet
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import surface_area
-from quasiharmonic.geometry.mesh.splitting import fans, renumber
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops, group_by_label
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_points
 
@@ -364,9 +364,8 @@ class PaperModel:
             label = int(pieces.label[rows[0]])
             # A label keeps its triangles unless more are joined to them.
             if label not in known or len(known[label].triangles) != rows.size:
-                own, corner = renumber(self._split(rows), self._F[rows])
-                uv = to_points(pieces.place[rows].ravel()[corner])
-                known[label] = Chart(rows, own, self._F[rows].ravel()[corner], uv, np.ones(rows.size), 0.0)
+                uv = to_points(pieces.place[rows].ravel())
+                known[label] = cut_out_chart(rows, self._split(rows), self._F[rows], uv, np.ones(rows.size))
             charts.append(known[label])
         return charts
 

@@ -15,12 +15,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
-from quasiharmonic.apps.unwrapping.unrolling import covers_once, lay_along, meet, spanning_links
+from quasiharmonic.apps.unwrapping.unrolling import covers_once, find_forest, lay_along, meet
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes, surface_area
 from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at
 from quasiharmonic.util.progress import heartbeat
 
 #: Edges with a larger angle between the normals are creases. Those of a cylinder with twelve sides, 30°, are not.
@@ -248,8 +248,7 @@ def _unroll(
     names, own = np.unique(split[rows], return_inverse=True)
     own = own.reshape(-1, 3)
     count = np.bincount(own.ravel())
-    z = np.bincount(own.ravel(), place[rows].real.ravel()) + 1j * np.bincount(own.ravel(), place[rows].imag.ravel())
-    z /= count
+    z = sum_at(own.ravel(), place[rows].ravel(), len(names)) / count
     origin = np.empty(len(names), dtype=np.int64)
     origin[own] = F[rows]
     kinds, which = np.unique(component[rows], return_inverse=True)
@@ -287,7 +286,7 @@ def _separate_touching(z: ComplexArray, F: IntArray, part: IntArray) -> ComplexA
     shortest = np.abs(corners - np.roll(corners, 1, axis=1)).min(axis=1)
     least = np.full(len(z), np.inf)
     np.minimum.at(least, F, shortest[:, None])
-    step = np.bincount(F.ravel(), inward.real.ravel()) + 1j * np.bincount(F.ravel(), inward.imag.ravel())
+    step = sum_at(F.ravel(), inward.ravel(), len(z))
     length = np.maximum(np.abs(step), np.finfo(float).tiny)
     return np.where(touching, z + _TUNING.apart * least * step / length, z)
 
@@ -304,11 +303,8 @@ def _is_stretched(V: FloatArray, F: IntArray, uv: FloatArray) -> BoolArray:
 def _lay(V: FloatArray, F: IntArray, hinges: Hinges, inside: BoolArray) -> ComplexArray:
     """Return the positions (f, 3) of triangles that are laid out along some hinges, flat and long ones first."""
     number = np.flatnonzero(inside)
-    rank = np.empty(number.size)
-    rank[np.lexsort((-hinges.length[number], ~hinges.flat[number]))] = np.arange(1, number.size + 1)
-    linked = np.zeros(inside.size, dtype=bool)
-    linked[number] = spanning_links(hinges.first[number], hinges.second[number], rank, len(F))
-    component = fans(F, ~hinges.mark_sides(linked, len(F)))[1]
+    order = np.lexsort((-hinges.length[number], ~hinges.flat[number]))
+    linked, _, component = find_forest(F, hinges, number[order])
     return lay_along(V, F, hinges.one[linked], hinges.other[linked], component)
 
 
