@@ -13,7 +13,7 @@ from quasiharmonic.apps.unwrapping.hinges import KEPT_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
 from quasiharmonic.geometry.mesh.topology import find_pairs, group_by_label, label_components
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, mark
 
 
 class CutTuning(NamedTuple):
@@ -98,7 +98,7 @@ def divide(chart: WorkingChart, bound: float) -> list[WorkingChart]:
     if chart.uv is not None:
         there = _excess(chart, bound)
         graph.cost[:] /= 1 + _TUNING.attraction * there[graph.ends].mean(axis=1)
-    return _open(chart, _line_between(chart, graph, *_far_ends(chart, graph))[graph.side].T)
+    return _open(chart, _line_between(chart, graph, *_far_ends(graph))[graph.side].T)
 
 
 def _excess(chart: WorkingChart, bound: float) -> FloatArray:
@@ -133,9 +133,7 @@ def _overlapping_parts(chart: WorkingChart) -> tuple[IntArray, IntArray]:
     vertices, the one that parts most crossings is used, and of several the longest.
     """
     loop = np.concatenate(chart.piece.loops)
-    place = np.empty(len(chart.V), dtype=np.int64)
-    place[loop] = np.arange(loop.size)
-    pairs = place[chart.crossings[:, (0, 2)]]
+    pairs = invert_indices(len(chart.V), loop)[chart.crossings[:, (0, 2)]]
     count = min(loop.size, _TUNING.samples)
     bins = pairs * count // loop.size
     crossed = np.zeros((count, count))
@@ -178,7 +176,7 @@ def _line_from(chart: WorkingChart, graph: EdgeGraph, one: int, other: int) -> B
     return line & ~graph.rim
 
 
-def _far_ends(chart: WorkingChart, graph: EdgeGraph) -> tuple[IntArray, IntArray]:
+def _far_ends(graph: EdgeGraph) -> tuple[IntArray, IntArray]:
     """Two vertices of a chart that are far from each other."""
     ends = [0]
     for _ in range(3):

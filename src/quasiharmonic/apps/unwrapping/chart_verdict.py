@@ -22,7 +22,7 @@ from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.loops import LoopEdges, Obstacle
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_twins, group_by_label, label_components
 from quasiharmonic.io.seamed_mesh import SeamedMesh
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of
 from quasiharmonic.util.outcome import Verdict, as_plain
 
 # Largest distance between the boxes of stacked charts, in sides of the texture. Congruent charts may differ by a share
@@ -160,10 +160,9 @@ def _rank_in_stack(uv: FloatArray, chart: IntArray) -> IntArray:
     )
     pairs = cKDTree(boxes).query_pairs(_SAME_PLACE, output_type="ndarray").astype(np.int64)
     label = label_components(pairs[:, 0], pairs[:, 1], len(boxes))
-    by_label = np.argsort(label, kind="stable")
-    first = np.flatnonzero(np.diff(label[by_label], prepend=-1))
-    rank = np.empty(len(boxes), dtype=np.int64)
-    rank[by_label] = np.arange(len(boxes)) - repeat_each(first, np.diff(first, append=len(boxes)))
+    rank = np.zeros(len(boxes), dtype=np.int64)
+    for group in group_by_label(label):
+        rank[group] = np.arange(group.size)
     return rank
 
 
@@ -200,13 +199,8 @@ def measure_clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vert
         i, j = i[apart], j[apart]
         for start in range(0, i.size, 1 << 16):
             one, other = i[start : start + (1 << 16)], j[start : start + (1 << 16)]
-            for a, b, c in (
-                (p[one], p[other], q[other]),
-                (q[one], p[other], q[other]),
-                (p[other], p[one], q[one]),
-                (q[other], p[one], q[one]),
-            ):
-                least = min(least, float(nearest_on_segments(a, b, c)[1].min()))
+            for a, b, ends in ((one, other, p), (one, other, q), (other, one, p), (other, one, q)):
+                least = min(least, float(nearest_on_segments(ends[a], p[b], q[b])[1].min()))
     return least if least <= reach else np.inf
 
 

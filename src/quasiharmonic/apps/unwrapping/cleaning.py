@@ -22,6 +22,7 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_weld,
     count_of,
+    invert_indices,
     mark,
     number_array,
     triangle_array,
@@ -304,9 +305,7 @@ def _number(fan: IntArray, corners: IntArray) -> tuple[IntArray, IntArray]:
     first = np.flatnonzero(label == np.arange(label.size))
     owner = corners.ravel()[first]
     order = np.argsort(owner, kind="stable")
-    number = np.empty(label.size, dtype=np.int64)
-    number[first[order]] = np.arange(first.size)
-    return number[fan], owner[order]
+    return invert_indices(label.size, first[order])[fan], owner[order]
 
 
 def _find_edges(joint: IntArray, corners: IntArray, pairs: IntArray) -> IntArray:

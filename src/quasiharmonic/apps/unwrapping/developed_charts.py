@@ -185,9 +185,7 @@ class PaperModel:
         self._watched = may_join & (one >= 0) & (other >= 0) & (one != other)
         between = np.flatnonzero(self._watched)
         low, high = np.minimum(one, other)[between], np.maximum(one, other)[between]
-        order = np.lexsort((high, low))
-        starts = np.flatnonzero(np.diff(low[order] * len(self._charts) + high[order], prepend=-1))
-        for group in np.split(order, starts[1:]) if order.size else []:
+        for group in group_by_label(low * len(self._charts) + high):
             a, b = int(low[group[0]]), int(high[group[0]])
             self._contacts[a][b] = self._contacts[b][a] = between[group]
 

@@ -103,7 +103,7 @@ class _Parts:
     """Parts of a surface (f, 3) whose triangles are connected by joined hinges (e,)."""
 
     def __init__(self, F: IntArray, hinges: Hinges, joined: BoolArray, angles: FloatArray, area: FloatArray) -> None:
-        self.joined = joined
+        self.F, self.hinges, self.joined = F, hinges, joined
         open_sides = ~hinges.mark_sides(joined, len(F))
         self.split, self.component = fans(F, pairs=(hinges.one[joined], hinges.other[joined]))
         self.count = int(self.component.max(initial=-1)) + 1
@@ -130,7 +130,7 @@ class _Parts:
         rough = np.bincount(part[corner], (rounded | (around >= _TUNING.many_pieces))[corner], self.count)
         self.rough = rough > _TUNING.rough * np.bincount(part[corner], minlength=self.count)
 
-    def find_cut(self, hinges: Hinges, k: int, here: IntArray, cost: FloatArray) -> IntArray:
+    def find_cut(self, k: int, here: IntArray, cost: FloatArray) -> IntArray:
         """Return the cheapest cut among hinges ``here`` of part ``k`` that gives a disk, its apexes on the boundary."""
         rows = np.flatnonzero(self.component == k)
         names, own = np.unique(self.split[rows], return_inverse=True)
@@ -138,7 +138,7 @@ class _Parts:
         terminal = np.full(len(names), -1)
         for number, loop in enumerate(loops):
             terminal[loop] = number
-        side = hinges.one[here]
+        side = self.hinges.one[here]
         ends = np.stack([self.split.ravel()[side], np.roll(self.split, -1, axis=1).ravel()[side]], axis=1)
         apexes = np.searchsorted(names, np.intersect1d(self.apexes, names))
         return _find_cut(np.searchsorted(names, ends), cost, terminal, apexes)
@@ -154,8 +154,9 @@ def _cut_costs(hinges: Hinges, cost: FloatArray, image: IntArray | None) -> Floa
     return dear
 
 
-def _drop_scattered(hinges: Hinges, parts: _Parts, chosen: BoolArray, rim: FloatArray) -> BoolArray:
+def _drop_scattered(parts: _Parts, chosen: BoolArray, rim: FloatArray) -> BoolArray:
     """Return the chosen parts (c,) without the small ones that mostly border on parts that are not chosen."""
+    hinges = parts.hinges
     one, other = parts.component[hinges.first], parts.component[hinges.second]
     apart = one != other
     one, other, length = one[apart], other[apart], hinges.length[apart]
@@ -203,27 +204,21 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
         rim: FloatArray = np.bincount(parts.component, outline.sum(axis=1), parts.count).astype(np.float64)
         if angle == CREASE:
             chosen &= ~parts.rough | (parts.area >= _TUNING.large_share)
-            chosen = _drop_scattered(hinges, parts, chosen, rim)
+            chosen = _drop_scattered(parts, chosen, rim)
         elif angle:
             chosen &= (parts.area >= _TUNING.min_share) & (rim**2 <= _TUNING.max_perimeter * parts.area * whole)
         if chosen.any():
-            _unroll(V, F, hinges, parts, chosen, cost, found, mirror)
+            _unroll(V, parts, chosen, cost, found, mirror)
         if (found.label >= 0).all():
             break
     return found
 
 
 def _unroll(
-    V: FloatArray,
-    F: IntArray,
-    hinges: Hinges,
-    parts: _Parts,
-    chosen: BoolArray,
-    cost: FloatArray,
-    found: Pieces,
-    mirror: Mirror | None,
+    V: FloatArray, parts: _Parts, chosen: BoolArray, cost: FloatArray, found: Pieces, mirror: Mirror | None
 ) -> None:
     """Unroll the chosen parts (c,) and add those that do not overlap themselves to the pieces."""
+    F, hinges = parts.F, parts.hinges
     inside = parts.joined & chosen[parts.component[hinges.first]]
     place = _lay(V, F, hinges, inside)
     joined = np.flatnonzero(inside)
@@ -238,7 +233,7 @@ def _unroll(
             # The mirror image of this part has been cut.
             cut[here] = cut[image[here]]
         else:
-            cut[here[parts.find_cut(hinges, k, here, dear[here])]] = True
+            cut[here[parts.find_cut(k, here, dear[here])]] = True
     if cut.any():
         place = _lay(V, F, hinges, inside & ~cut)
         # Cuts to holes that need none close again.
