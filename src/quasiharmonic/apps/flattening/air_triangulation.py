@@ -137,19 +137,14 @@ class Air:
 
 
 def triangulate_air(
-    F: ArrayLike,
-    uv: ArrayLike,
-    loops: Sequence[IntArray],
-    *,
-    margin: float = 0.5,
-    around: ArrayLike | None = None,
+    uv: ArrayLike, loops: Sequence[IntArray], *, margin: float = 0.5, around: ArrayLike | None = None
 ) -> Air:
     """Triangulate the plane around a flat surface up to a frame, and its holes.
 
-    ``np.concatenate([F, air.F])`` is a triangle mesh whose only boundary is the frame. ``uv`` (n, 2) must be bijective,
-    otherwise ValueError; its interior vertices are not read. The ``loops`` have the surface on their left. The frame
-    encloses the positions ``around`` (p, 2) too. Its distance is ``margin`` times the longer side of the boundary's
-    bounding box. The result is deterministic.
+    The surface's triangles and ``air.F`` together are a triangle mesh whose only boundary is the frame. ``uv`` (n, 2)
+    must be bijective, otherwise ValueError; its interior vertices are not read. The ``loops`` have the surface on their
+    left. The frame encloses the positions ``around`` (p, 2) too. Its distance is ``margin`` times the longer side of
+    the boundary's bounding box. The result is deterministic.
     """
     if not 0 < margin < np.inf:
         raise ValueError(f"margin must be positive, not {margin}")

@@ -95,8 +95,7 @@ class Hierarchy:
         self._n = n = len(V)
         self._n_filled = n + len(loops)
         filled = make_fans(loops, n)
-        held = np.zeros(self._n_filled, dtype=bool)
-        held[n:] = True
+        held = np.arange(self._n_filled) >= n
         self._coarsening = coarsen(np.concatenate([F, filled]), held.size, held, goal + len(loops))
         self._rounds = len(self._coarsening.rounds)
         # There are meshes before some of the rounds, and after the last.
