@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from io import BytesIO
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,13 +76,8 @@ def sample(pixels: Bytes, use: ImageUse, uv: FloatArray, *, srgb: bool) -> NDArr
     )
     tables = [_LINEAR if srgb else _PLAIN] * 3 + [_PLAIN]
     values: NDArray[np.floating] = np.zeros((len(uv), 4), dtype=np.float32)
-    for row, column, weight in (
-        (top, left, (1 - x) * (1 - y)),
-        (top, right, x * (1 - y)),
-        (bottom, left, (1 - x) * y),
-        (bottom, right, x * y),
-    ):
-        pixel = flat[row * width + column]
+    for (row, down), (column, along) in product(((top, 1 - y), (bottom, y)), ((left, 1 - x), (right, x))):
+        pixel, weight = flat[row * width + column], along * down
         for channel, table in enumerate(tables):
             values[:, channel] += weight * table[pixel[:, channel]]
     values[missing] = np.nan
