@@ -188,17 +188,12 @@ def _cover(points: FloatArray, margin: float) -> _Squares:
 
 def _frame(corner: FloatArray, side: float, shape: tuple[int, int]) -> FloatArray:
     """A rectangle with bent sides, counterclockwise, with one point per square along it; (h, 2) float64."""
-    width, height = side * shape[0], side * shape[1]
+    corners = side * np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * shape
     frame = []
-    for start, along, outward, count in (
-        ((0.0, 0.0), (width, 0.0), (0, -1), shape[0]),
-        ((width, 0.0), (0.0, height), (1, 0), shape[1]),
-        ((width, height), (-width, 0.0), (0, 1), shape[0]),
-        ((0.0, height), (0.0, -height), (-1, 0), shape[1]),
-    ):
-        t = (np.arange(count) / count)[:, None]
-        bulge = 4 * _TUNING.bulge * np.hypot(*along) * t * (1 - t)
-        frame.append(corner + start + t * np.array(along) + bulge * np.array(outward))
+    for start, along, count in zip(corners, np.roll(corners, -1, axis=0) - corners, (*shape, *shape), strict=True):
+        length, t = np.abs(along).max(), (np.arange(count) / count)[:, None]
+        bulge = 4 * _TUNING.bulge * length * t * (1 - t)
+        frame.append(corner + start + t * along + bulge * np.sign([along[1], -along[0]]))
     return np.concatenate(frame)
 
 

@@ -140,8 +140,7 @@ def _overlapping_parts(chart: WorkingChart) -> tuple[IntArray, IntArray]:
     np.add.at(crossed, (bins[:, 0], bins[:, 1]), 1)
     np.add.at(crossed, (bins[:, 1], bins[:, 0]), 1)
     # Sums over all arcs from sample i up to before sample j.
-    both = np.zeros((count + 1, count + 1))
-    both[1:, 1:] = crossed.cumsum(axis=0).cumsum(axis=1)
+    both = np.pad(crossed.cumsum(axis=0).cumsum(axis=1), [(1, 0), (1, 0)])
     ends = np.arange(count + 1)
     i, j = (ends[:, None], ends[None, :])
     inside = both[j, j] - both[i, j] - both[j, i] + both[i, i]
@@ -221,16 +220,10 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     apart = a != b
     a, b, capacity = a[apart], b[apart], capacity[apart]
     size = numbers.size
-    network = csr_array(
-        (np.concatenate([capacity, capacity]), (np.concatenate([a, b]), np.concatenate([b, a]))),
-        shape=(size, size),
-        dtype=np.int32,
-    )
-    network.sum_duplicates()
+    one_way = csr_array((capacity, (a, b)), shape=(size, size))
+    network = one_way + one_way.T
     flow = maximum_flow(network, size - 2, size - 1).flow
-    rest = (network - flow).tocsr()
-    rest.data[rest.data < 0] = 0
-    rest.eliminate_zeros()
+    rest = (network - flow).maximum(0)
     reached = mark(size, breadth_first_order(rest, size - 2, return_predecessors=False))
     side = reached[node[:k]]
     return mark(len(graph.ends), edge[side[first] != side[second]])

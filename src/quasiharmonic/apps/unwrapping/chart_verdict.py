@@ -217,11 +217,7 @@ class SetApart:
 
     def to_dict(self) -> dict[str, list[int]]:
         """Return the triangles for JSON."""
-        return {
-            "reversed_triangles": self.reversed.tolist(),
-            "repeated_triangles": self.repeated.tolist(),
-            "degenerate_triangles": self.degenerate.tolist(),
-        }
+        return {f"{kind}_triangles": found.tolist() for kind, found in vars(self).items()}
 
     def summary(self) -> str:
         """Return one line for each kind."""
