@@ -8,6 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import hard_models as models
+from quasiharmonic.apps.atlas.packing.bitmap_search import Textures
 from quasiharmonic.apps.atlas.packing.layout import estimate_use, find_layout
 from quasiharmonic.apps.atlas.packing.shapes import make_shape
 from quasiharmonic.apps.unwrapping.developed_charts import PaperModel
@@ -207,12 +208,12 @@ def test_estimates_of_the_use_are_close_to_layouts(sides):
         make_shape(np.array([[0, 0], [a, 0], [a, b], [0, b]], dtype=float), np.array([[0, 1, 2], [0, 2, 3]]))
         for a, b in sides
     ]
-    estimate = estimate_use(shapes, (1024, 1024), 4, 1, rotate=True)
-    layout = find_layout(shapes, (1024, 1024), 4, 1, rotate=True, scale=None)
+    estimate = estimate_use(shapes, Textures((1024, 1024), 4, 1, rotate=True))
+    layout = find_layout(shapes, Textures((1024, 1024), 4, 1, rotate=True), None)
     used = sum(a * b for a, b in sides) * (layout.scale / 1024) ** 2
     assert used - 0.15 <= estimate <= min(used + 0.02, 1)
 
 
 def test_the_use_of_shapes_that_do_not_fit_is_zero():
     shapes = [make_shape(np.array([[0, 0], [1, 0], [0, 1.0]]), np.array([[0, 1, 2]]))] * 200
-    assert estimate_use(shapes, (64, 64), 8, 1, rotate=True) == 0
+    assert estimate_use(shapes, Textures((64, 64), 8, 1, rotate=True)) == 0

@@ -109,8 +109,8 @@ def test_finer_levels_of_an_isometric_map_that_overlaps_are_free_again(guarded):
 
     # The ring turns by more than a full turn, so its isometric map overlaps itself.
     V, loops = np.column_stack([ring(7), 0.02 * square[:, 0]]), boundary_loops(F, len(square))
-    level = Level(0, np.arange(len(V)), F, loops)
-    uv, needs_guard = descend_level(V, level, ring(6.1), "auto", guarded, 100)
+    level = Level(0, np.arange(len(V)), V, F, loops)
+    uv, needs_guard = descend_level(level, ring(6.1), "auto", guarded, 100)
     assert certify(F, uv, loops=loops).bijective
     assert needs_guard is guarded
 

@@ -38,7 +38,7 @@ def blocks(gap, seed=0):
 def checked(F, uv, **options):
     """Make the air mesh and check its guarantees independently; return it, and the joint points and triangles."""
     before = uv.copy()
-    air = triangulate_air(F, uv, boundary_loops(F, len(uv)), **options)
+    air = triangulate_air(uv, boundary_loops(F, len(uv)), **options)
     assert np.array_equal(uv, before)
     points, triangles = np.concatenate([uv, air.points]), np.concatenate([F, air.F])
     verdict = certify(triangles, points)
@@ -108,7 +108,7 @@ def test_the_unit_of_length_does_not_matter(scale, offset):
 
 def test_is_deterministic():
     V, F = annulus(8)
-    first, second = (triangulate_air(F, V, boundary_loops(F, len(V))) for _ in range(2))
+    first, second = (triangulate_air(V, boundary_loops(F, len(V))) for _ in range(2))
     assert np.array_equal(first.points, second.points)
     assert np.array_equal(first.F, second.F)
 
@@ -117,13 +117,13 @@ def test_a_boundary_that_meets_itself_is_rejected():
     F, uv = blocks(1e-2)
     uv[len(uv) // 2 :, 1] -= 1e-2
     with pytest.raises(ValueError, match="meets itself"):
-        triangulate_air(F, uv, boundary_loops(F, len(uv)))
+        triangulate_air(uv, boundary_loops(F, len(uv)))
 
 
 def test_a_margin_must_be_positive():
     V, F = disk(3)
     with pytest.raises(ValueError, match="margin"):
-        triangulate_air(F, V, boundary_loops(F, len(V)), margin=0)
+        triangulate_air(V, boundary_loops(F, len(V)), margin=0)
 
 
 def in_circles(points, triangles):

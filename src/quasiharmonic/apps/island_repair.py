@@ -113,8 +113,7 @@ class IslandRepair:
 
     def _find_near(self, triangles: IntArray, rings: int) -> BoolArray:
         """Interior vertices within a number of rings of triangles; the triangles' own vertices are the first ring."""
-        near: BoolArray = mark_rings(self._F, mark(len(self.uv), self._F[triangles]), rings - 1) & ~self._fixed
-        return near
+        return mark_rings(self._F, mark(len(self.uv), self._F[triangles]), rings - 1) & ~self._fixed
 
     def _components(self, free: BoolArray) -> Iterator[BoolArray]:
         """Split free vertices into the sets that edges connect."""

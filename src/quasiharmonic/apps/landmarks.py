@@ -85,8 +85,7 @@ def make_landmarks(
 
 def is_on_border(points: FloatArray, size: IntArray) -> BoolArray:
     """Which points (k, 2) are on the image's border."""
-    edge: BoolArray = ((points == 0) | (points == size)).any(axis=1)
-    return edge
+    return np.asarray(((points == 0) | (points == size)).any(axis=1))
 
 
 def _points(points: ArrayLike, name: str) -> FloatArray:

@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from io import BytesIO
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from quasiharmonic.io.errors import printable_path
 from quasiharmonic.io.models.appearance import Appearance, ImageUse, NamedImage, Role, SurfaceMaterial, Wrap, to_linear
 from quasiharmonic.io.models.meshdata import MeshData, normals_of
 from quasiharmonic.io.models.textures import Texture, texture_of
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, first_equal
 from quasiharmonic.util.hints import explain_missing
 
 Bytes = NDArray[np.uint8]
@@ -74,13 +76,8 @@ def sample(pixels: Bytes, use: ImageUse, uv: FloatArray, *, srgb: bool) -> NDArr
     )
     tables = [_LINEAR if srgb else _PLAIN] * 3 + [_PLAIN]
     values: NDArray[np.floating] = np.zeros((len(uv), 4), dtype=np.float32)
-    for row, column, weight in (
-        (top, left, (1 - x) * (1 - y)),
-        (top, right, x * (1 - y)),
-        (bottom, left, (1 - x) * y),
-        (bottom, right, x * y),
-    ):
-        pixel = flat[row * width + column]
+    for (row, down), (column, along) in product(((top, 1 - y), (bottom, y)), ((left, 1 - x), (right, x))):
+        pixel, weight = flat[row * width + column], along * down
         for channel, table in enumerate(tables):
             values[:, channel] += weight * table[pixel[:, channel]]
     values[missing] = np.nan
@@ -119,10 +116,8 @@ def encode(pixels: Bytes, *, jpeg: bool) -> Texture:
     with explain_missing("images need Pillow", "pillow"):
         from PIL import Image
     file = BytesIO()
-    if jpeg:
-        Image.fromarray(pixels).save(file, "JPEG", quality=95, subsampling=0)
-    else:
-        Image.fromarray(pixels).save(file, "PNG", compress_level=4)
+    kind, options = ("JPEG", {"quality": 95, "subsampling": 0}) if jpeg else ("PNG", {"compress_level": 4})
+    Image.fromarray(pixels).save(file, kind, **options)
     texture = texture_of(file.getvalue())
     assert texture is not None
     return texture
@@ -131,44 +126,11 @@ def encode(pixels: Bytes, *, jpeg: bool) -> Texture:
 def find_sources(covered: BoolArray, padding: int) -> tuple[IntArray, IntArray]:
     """Return the texels that are not covered (h, w), within a distance, and the covered texel nearest to each.
 
-    Texels are numbers in the flattened image. The fronts of covered texels grow by one texel at a time, to the eight
-    neighbours, and carry their sources along.
+    Texels are numbers in the flattened image, and distances along rows and columns.
     """
-    height, width = covered.shape
-    source = np.where(covered.ravel(), np.arange(covered.size, dtype=np.int32), -1)
-    front = np.flatnonzero(_touches(covered))
-    found = [np.empty(0, dtype=np.int64)]
-    for _ in range(padding):
-        row, column = np.divmod(front, width)
-        near, origin = [], []
-        for down, along in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
-            inside = (row + down >= 0) & (row + down < height) & (column + along >= 0) & (column + along < width)
-            texel = front[inside] + down * width + along
-            free = source[texel] < 0
-            near.append(texel[free])
-            origin.append(source[front[inside][free]])
-        texel, at = np.concatenate(near), np.concatenate(origin).astype(np.int64)
-        row_apart, apart = np.divmod(texel, width)[0] - at // width, texel % width - at % width
-        # The nearest source of each texel comes first.
-        order = np.lexsort((at, row_apart**2 + apart**2, texel))
-        texel, at = texel[order], at[order]
-        first = np.diff(texel, prepend=-1) != 0
-        front = texel[first]
-        source[front] = at[first]
-        found.append(front)
-    texels = np.concatenate(found)
-    return texels, source[texels].astype(np.int64)
-
-
-def _touches(covered: BoolArray) -> BoolArray:
-    """Return which covered texels have a neighbour that is not covered."""
-    free = np.pad(~covered, 1)
-    height, width = covered.shape
-    some = np.zeros_like(covered)
-    for i in range(3):
-        for j in range(3):
-            some |= free[i : i + height, j : j + width]
-    return some & covered
+    near = maximum_filter(covered, 2 * padding + 1, mode="constant") & ~covered
+    nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    return np.flatnonzero(near), np.ravel_multi_index(tuple(nearest[:, near]), covered.shape)
 
 
 class TangentFrames(NamedTuple):
@@ -227,20 +189,11 @@ def tangent_frames(mesh: MeshData, uv: FloatArray) -> TangentFrames:
         angle[:, i] = np.arccos(np.clip((one * other).sum(axis=1), -1, 1))
     keys = np.concatenate([uv, normal, np.repeat(side[:, None, None], 3, axis=1)], axis=2).reshape(mesh.F.size, -1)
     keys = np.column_stack([mesh.F.ravel(), (keys + 0.0).view(np.int64)])
-    group = _number_rows(keys)
+    group = first_equal(keys)
     weighted = (tangent * angle[:, :, None]).reshape(-1, 3)
     total: FloatArray = np.stack([np.bincount(group, weighted[:, i]) for i in range(3)], axis=1)
     smooth = _reject(total[group].reshape(tangent.shape), normal)
     return TangentFrames(normal, np.where((smooth != 0).any(axis=2, keepdims=True), smooth, tangent), side)
-
-
-def _number_rows(keys: IntArray) -> IntArray:
-    """Return a number for each row of integers (k, d), equal for equal rows."""
-    order = np.lexsort(keys.T)
-    new = np.concatenate([[True], (np.diff(keys[order], axis=0) != 0).any(axis=1)])
-    number = np.empty(len(keys), dtype=np.int64)
-    number[order] = np.cumsum(new) - 1
-    return number
 
 
 def _reject(vectors: FloatArray, normal: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from quasiharmonic.io.objects import MeshLike, as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh, which_island
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, names_of
 from quasiharmonic.util.hints import make_dataframe
-from quasiharmonic.util.outcome import Verdict
+from quasiharmonic.util.outcome import Verdict, as_plain
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -95,9 +95,7 @@ class IslandVerdict(IslandReport):
         """The verdict for JSON, with the first triangle and the number of triangles."""
         return {
             **super().to_dict(),
-            "injective": self.injective,
-            "bijective": self.bijective,
-            "inverted": self.inverted.tolist(),
+            **as_plain(self, "injective", "bijective", "inverted"),
             "reasons": [reason.text for reason in self.certificate.reasons],
         }
 

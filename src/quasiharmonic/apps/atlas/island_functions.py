@@ -43,6 +43,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_bool,
     check_non_negative,
+    check_range,
     index_array,
     map_array,
     names_of,
@@ -456,9 +457,7 @@ def _check_fixed(mesh: SeamedMesh, fixed: ArrayLike | None) -> IntArray | None:
     if fixed is None:
         return None
     array = index_array("fixed", fixed).ravel()
-    absent = array[(array < 0) | (array >= len(mesh.V))]
-    if absent.size:
-        raise ValueError(f"fixed refers to {names_of('vertex', 'vertices', absent)}, which the mesh does not have")
+    check_range("fixed", array, len(mesh.V))
     return array
 
 

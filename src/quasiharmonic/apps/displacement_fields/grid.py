@@ -290,5 +290,4 @@ def grow(points: BoolArray, steps: int, fixed: BoolArray) -> BoolArray:
     """Add all points within a number of steps, each along any of the axes, except fixed ones."""
     from scipy.ndimage import maximum_filter
 
-    around: BoolArray = maximum_filter(points, 2 * steps + 1, mode="constant") & ~fixed
-    return around
+    return np.asarray(maximum_filter(points, 2 * steps + 1, mode="constant") & ~fixed)

@@ -137,19 +137,14 @@ class Air:
 
 
 def triangulate_air(
-    F: ArrayLike,
-    uv: ArrayLike,
-    loops: Sequence[IntArray],
-    *,
-    margin: float = 0.5,
-    around: ArrayLike | None = None,
+    uv: ArrayLike, loops: Sequence[IntArray], *, margin: float = 0.5, around: ArrayLike | None = None
 ) -> Air:
     """Triangulate the plane around a flat surface up to a frame, and its holes.
 
-    ``np.concatenate([F, air.F])`` is a triangle mesh whose only boundary is the frame. ``uv`` (n, 2) must be bijective,
-    otherwise ValueError; its interior vertices are not read. The ``loops`` have the surface on their left. The frame
-    encloses the positions ``around`` (p, 2) too. Its distance is ``margin`` times the longer side of the boundary's
-    bounding box. The result is deterministic.
+    The surface's triangles and ``air.F`` together are a triangle mesh whose only boundary is the frame. ``uv`` (n, 2)
+    must be bijective, otherwise ValueError; its interior vertices are not read. The ``loops`` have the surface on their
+    left. The frame encloses the positions ``around`` (p, 2) too. Its distance is ``margin`` times the longer side of
+    the boundary's bounding box. The result is deterministic.
     """
     if not 0 < margin < np.inf:
         raise ValueError(f"margin must be positive, not {margin}")
@@ -193,17 +188,12 @@ def _cover(points: FloatArray, margin: float) -> _Squares:
 
 def _frame(corner: FloatArray, side: float, shape: tuple[int, int]) -> FloatArray:
     """A rectangle with bent sides, counterclockwise, with one point per square along it; (h, 2) float64."""
-    width, height = side * shape[0], side * shape[1]
+    corners = side * np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * shape
     frame = []
-    for start, along, outward, count in (
-        ((0.0, 0.0), (width, 0.0), (0, -1), shape[0]),
-        ((width, 0.0), (0.0, height), (1, 0), shape[1]),
-        ((width, height), (-width, 0.0), (0, 1), shape[0]),
-        ((0.0, height), (0.0, -height), (-1, 0), shape[1]),
-    ):
-        t = (np.arange(count) / count)[:, None]
-        bulge = 4 * _TUNING.bulge * np.hypot(*along) * t * (1 - t)
-        frame.append(corner + start + t * np.array(along) + bulge * np.array(outward))
+    for start, along, count in zip(corners, np.roll(corners, -1, axis=0) - corners, (*shape, *shape), strict=True):
+        length, t = np.abs(along).max(), (np.arange(count) / count)[:, None]
+        bulge = 4 * _TUNING.bulge * length * t * (1 - t)
+        frame.append(corner + start + t * along + bulge * np.sign([along[1], -along[0]]))
     return np.concatenate(frame)
 
 

@@ -21,12 +21,9 @@ from quasiharmonic.apps.flattening.distance_descent import (
 )
 from quasiharmonic.apps.flattening.multilevel import (
     COARSEST,
-    RATIO,
-    STEPS,
     Hierarchy,
     Level,
-    descend_level,
-    flatten_levels,
+    flatten_level,
     prolong_map,
 )
 from quasiharmonic.apps.flattening.piece import Piece, to_given_unit
@@ -57,14 +54,11 @@ def lower_coarse_distance_error(piece: Piece, options: DistanceOptions, *, least
     n, solver = len(piece.V), options.linear_solver
     hierarchy = Hierarchy(piece.V, piece.F, piece.loops, COARSEST)
     stop = hierarchy.coarsest(max(least, n * (_RINGS / rings) ** 2))
-    stops = [*(coarser for coarser in hierarchy.select_stops(RATIO) if coarser > stop), stop]
-    uv = flatten_levels(hierarchy, stops, solver) if stop else None
-    if uv is None:
+    coarse = flatten_level(hierarchy, stop, solver) if stop else None
+    if coarse is None:
         return None
-    level = hierarchy.level(stop)
-    V = piece.V[level.vertices]
-    uv, _ = descend_level(V, level, uv, solver, False, STEPS[1])
-    barrier = thick_energy(V, level.F)
+    level, uv = coarse
+    barrier = thick_energy(level.V, level.F)
     barrier.energy = SymmetricDirichlet()
     value = barrier.value(in_units(uv, 0))
     run.add_stage("start, coarse", energy=(value, value))
@@ -88,7 +82,7 @@ def _measure_distances(hierarchy: Hierarchy, level: Level, rings: int) -> Surfac
     if rings * np.sqrt(finer.vertices.size / len(hierarchy.V)) > _MAX_RINGS:
         finer = level
     found = sample_distances(
-        hierarchy.V[finer.vertices],
+        finer.V,
         finer.F,
         choose_sampling(round(rings * np.sqrt(finer.vertices.size / len(hierarchy.V)))),
         among=np.searchsorted(finer.vertices, level.vertices),

@@ -235,8 +235,7 @@ class Rim:
         ahead, behind = p[self._next[i]] - p[i], p[self._previous[i]] - p[i]
         left, right = (ahead.conj() * direction).imag > 0, (direction.conj() * behind).imag > 0
         convex = (ahead.conj() * behind).imag > 0
-        inside: BoolArray = np.where(convex, left & right, left | right)
-        return inside
+        return np.where(convex, left & right, left | right)
 
 
 def smallest_heights(w: ComplexArray, F: IntArray) -> FloatArray:

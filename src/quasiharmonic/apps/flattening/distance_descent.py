@@ -131,18 +131,15 @@ class DistanceEnergy:
 
     def differences(self, w: ComplexArray) -> ComplexArray:
         """Return the vectors (k,) from targets to sources, for vertices (n,)."""
-        apart: ComplexArray = w.take(self._source) - w.take(self._target)
-        return apart
+        return np.asarray(w.take(self._source) - w.take(self._target))
 
     def gather(self, pull: ComplexArray) -> ComplexArray:
         """Sum at every vertex (n,) the forces (k,) of its pairs, with opposite signs for sources and targets."""
-        sums: FloatArray = self._pull @ to_points(pull)
-        return to_complex(sums)
+        return to_complex(self._pull @ to_points(pull))
 
     def sum_at_vertices(self, values: FloatArray) -> FloatArray:
         """Sum at every vertex, (n, c), the values of its pairs, (k, c)."""
-        sums: FloatArray = self._share @ values
-        return sums
+        return np.asarray(self._share @ values)
 
     def deform(self, w: ComplexArray) -> _DistanceValues:
         """Evaluate the quantities of a map that the other methods need."""

@@ -11,9 +11,9 @@ converged map overlaps itself, the descent starts again with the guard.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypedDict, Unpack
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,7 +26,7 @@ from quasiharmonic.apps.flattening.connected_parts import (
     place_in_row,
     split_parts,
 )
-from quasiharmonic.apps.flattening.distance_descent import lower_distance_error
+from quasiharmonic.apps.flattening.distance_descent import DistanceKeywords, lower_distance_error
 from quasiharmonic.apps.flattening.flattening_run import Flattening
 from quasiharmonic.apps.flattening.initial_maps import COARSE_FROM
 from quasiharmonic.apps.flattening.piece import Piece, check_in_range, to_given_unit
@@ -37,7 +37,7 @@ from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.mesh.splitting import weld_triangles
 from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.linsolve import check_name
-from quasiharmonic.problem.result import MapResult, Status, Step
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run, finish_result, run_within
 from quasiharmonic.util.arrays import (
     FloatArray,
@@ -58,7 +58,7 @@ _SAMPLED = 10.0
 _DESCENDED = Status.POLISHED, Status.EXHAUSTED, Status.STILL_FALLING, Status.COLLAPSED
 
 
-class FlattenKeywords(TypedDict, total=False):
+class FlattenKeywords(DistanceKeywords, total=False):
     """Types of the options of `flatten`."""
 
     fixed: ArrayLike | None
@@ -67,14 +67,8 @@ class FlattenKeywords(TypedDict, total=False):
     weights: ArrayLike | None
     start: ArrayLike | None
     unit_square: bool
-    rings: int
     gap: float
     weld: bool | float
-    max_iterations: int
-    tol: float
-    linear_solver: str
-    callback: Callable[[Step], object] | None
-    record_every: int
     time_limit: float | None
 
 

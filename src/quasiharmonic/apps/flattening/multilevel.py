@@ -63,8 +63,8 @@ _HEIGHTS = tuple(0.3 * 4.0**-k for k in range(18))
 COARSEST = 150
 #: Minimum ratio between the vertex counts of successive meshes.
 RATIO = 4.0
-#: Maximum number of steps on the coarsest mesh, and on the others.
-STEPS = (300, 40)
+# Maximum number of steps on the coarsest mesh, and on the others.
+_STEPS = (300, 40)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +72,12 @@ class Level:
     """One mesh of a hierarchy, with its own vertex numbering.
 
     ``stop`` is the hierarchy's stop that the mesh belongs to. ``vertices`` (m,) are the finest mesh's indices of its
-    vertices, ascending.
+    vertices, ascending, and ``V`` (m, 3) their positions.
     """
 
     stop: int
     vertices: IntArray
+    V: FloatArray
     F: IntArray
     loops: list[IntArray]
 
@@ -94,8 +95,7 @@ class Hierarchy:
         self._n = n = len(V)
         self._n_filled = n + len(loops)
         filled = make_fans(loops, n)
-        held = np.zeros(self._n_filled, dtype=bool)
-        held[n:] = True
+        held = np.arange(self._n_filled) >= n
         self._coarsening = coarsen(np.concatenate([F, filled]), held.size, held, goal + len(loops))
         self._rounds = len(self._coarsening.rounds)
         # There are meshes before some of the rounds, and after the last.
@@ -124,8 +124,7 @@ class Hierarchy:
     def _left(self) -> IntArray:
         """Numbers of vertices left after each number of rounds."""
         removed = [0, *(sum(vertices.size for vertices, _ in removals) for removals in self._coarsening.rounds)]
-        left: IntArray = self._n - np.cumsum(removed)
-        return left
+        return np.asarray(self._n - np.cumsum(removed))
 
     def level(self, stop: int) -> Level:
         """Return the mesh at a stop."""
@@ -135,7 +134,7 @@ class Hierarchy:
         vertices = np.flatnonzero(used)
         number = invert_indices(self._n, vertices)
         F = number[T]
-        return Level(stop, vertices, F, boundary_loops(F, vertices.size))
+        return Level(stop, vertices, self.V[vertices], F, boundary_loops(F, vertices.size))
 
     def prolong(
         self,
@@ -237,8 +236,7 @@ def _fit_affine(flat: ComplexArray, around: ComplexArray) -> ComplexArray:
     a = (first * of_b - first.conj() * second) / determinant
     b = (first.conj() * of_a - first * second.conj()) / determinant
     load = (weight * arm).sum(axis=1) - a * (weighted.conj() * arm).sum(axis=1) - b * (weighted * arm).sum(axis=1)
-    place: ComplexArray = middle + load / ((1 + 1e-12) * scale - (a * first.conj() + b * first).real)
-    return place
+    return np.asarray(middle + load / ((1 + 1e-12) * scale - (a * first.conj() + b * first).real))
 
 
 def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, rim: bool) -> BoolArray:
@@ -253,16 +251,13 @@ def _keeps_shape(flat: ComplexArray, place: ComplexArray, around: ComplexArray, 
     rest = np.maximum(rest, LOWEST * longest**2)
     scale = area.sum(axis=1) / rest.sum(axis=1)
     least = np.maximum(_TUNING.min_area_share * scale[:, None] * rest, 0)
-    good: BoolArray = (area > least).all(axis=1)
-    return good
+    return np.asarray((area > least).all(axis=1))
 
 
 def _fan_positive(ring: ComplexArray) -> BoolArray:
     """Whether the fan from the first vertex of each ring has only positive triangles."""
     arm = ring[:, 1:] - ring[:, :1]
-    twice_area: FloatArray = (arm[:, :-1].conj() * arm[:, 1:]).imag
-    positive: BoolArray = np.all(twice_area > 0, axis=1)
-    return positive
+    return np.asarray(((arm[:, :-1].conj() * arm[:, 1:]).imag > 0).all(axis=1))
 
 
 def flatten_coarse(
@@ -291,17 +286,25 @@ def flatten_levels(
     for stop in stops:
         level = hierarchy.level(stop)
         if here is None:
-            uv = map_to_disk(hierarchy.V[level.vertices], level.F, level.loops, linear_solver)
+            uv = map_to_disk(level.V, level.F, level.loops, linear_solver)
         else:
             assert uv is not None
             uv = prolong_map(hierarchy, here, level, uv, linear_solver)
         if uv is None or stop == stops[-1]:
             return uv
-        uv, guarded = descend_level(
-            hierarchy.V[level.vertices], level, uv, linear_solver, guarded, STEPS[here is not None]
-        )
+        uv, guarded = descend_level(level, uv, linear_solver, guarded, _STEPS[here is not None])
         here = level
     return uv
+
+
+def flatten_level(hierarchy: Hierarchy, stop: int, linear_solver: str) -> tuple[Level, FloatArray] | None:
+    """Return the mesh at a stop and its bijective map (m, 2), with a descent on it; None if rounding prevents one."""
+    stops = [*(coarser for coarser in hierarchy.select_stops(RATIO) if coarser > stop), stop]
+    uv = flatten_levels(hierarchy, stops, linear_solver)
+    if uv is None:
+        return None
+    level = hierarchy.level(stop)
+    return level, descend_level(level, uv, linear_solver, False, _STEPS[1])[0]
 
 
 def prolong_map(
@@ -318,7 +321,7 @@ def prolong_map(
         uv = to_points(fine[there.vertices])
         met = rim.meetings(uv)
         if not met.size and is_injective(there.F, uv):
-            return smooth_map(hierarchy.V[there.vertices], there.F, there.loops, uv, linear_solver)
+            return smooth_map(there.V, there.F, there.loops, uv, linear_solver)
         # Boundary vertices at intersections are placed inside the coarse image, and from `late` on all of them.
         late = height < _TUNING.late
         kept_inside[there.vertices if late else there.vertices[met]] = True
@@ -326,7 +329,7 @@ def prolong_map(
 
 
 def descend_level(
-    V: FloatArray, level: Level, uv: FloatArray, linear_solver: str, guarded: bool, steps: int
+    level: Level, uv: FloatArray, linear_solver: str, guarded: bool, steps: int
 ) -> tuple[FloatArray, bool]:
     """Lower the symmetric Dirichlet energy of a level's bijective map, if ``guarded`` with a guard from the beginning.
 
@@ -334,7 +337,7 @@ def descend_level(
     overlaps itself, only the coarse boundary does so.
     """
     rim = Rim(level.loops)
-    energy = thick_energy(V, level.F)
+    energy = thick_energy(level.V, level.F)
 
     def lower(rim: Rim | None) -> FloatArray:
         descent = SurfaceDescent(energy, uv, linear_solver, rim=rim, iterate=True)

@@ -221,7 +221,7 @@ class PinSearch:
         """Solve surface and air together, from a bijective map of the surface, with frame and pins fixed."""
         n, piece = len(flat), self._piece
         try:
-            air = triangulate_air(piece.F, flat, piece.loops, margin=margin, around=self._target)
+            air = triangulate_air(flat, piece.loops, margin=margin, around=self._target)
         except ValueError:
             # There are no doubles between close parts of the boundary.
             self.status = Status.ROUNDED

@@ -21,7 +21,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.multilevel import COARSEST, RATIO, STEPS, Hierarchy, descend_level, flatten_levels
+from quasiharmonic.apps.flattening.multilevel import (
+    COARSEST,
+    Hierarchy,
+    flatten_level,
+)
 from quasiharmonic.apps.flattening.worst_triangles import mark_around, thick_energy
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, SymmetricDirichlet
@@ -98,14 +102,11 @@ def _prolong_coarse_map(
     """
     hierarchy = Hierarchy(V, F, list(loops), COARSEST)
     coarse = hierarchy.coarsest(len(V) / _TUNING.ratio)
-    stops = [*(stop for stop in hierarchy.select_stops(RATIO) if stop > coarse), coarse]
-    uv = flatten_levels(hierarchy, stops, linear_solver)
-    if uv is None:
+    found = flatten_level(hierarchy, coarse, linear_solver)
+    if found is None:
         return None
-    level = hierarchy.level(coarse)
-    V_coarse = V[level.vertices]
-    uv, _ = descend_level(V_coarse, level, uv, linear_solver, False, STEPS[1])
-    if thick_energy(V_coarse, level.F).value(in_units(uv, 0)) > _TUNING.max_coarse_energy:
+    level, uv = found
+    if thick_energy(level.V, level.F).value(in_units(uv, 0)) > _TUNING.max_coarse_energy:
         return None
     w = np.zeros(len(V), dtype=np.complex128)
     w[level.vertices] = in_units(uv, 0)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.geometry.exact.predicates import ROUNDS_ONCE, exact_sum, two_product, two_sum
+from quasiharmonic.geometry.mesh.topology import label_components, pair_keys
 from quasiharmonic.util.arrays import FloatArray, IntArray, repeat_each
 from quasiharmonic.util.progress import heartbeat
 
@@ -253,21 +254,15 @@ def _group(rows: IntArray, n: int) -> tuple[IntArray, IntArray]:
 
 def find_patches(boundary: IntArray) -> IntArray:
     """Number the parts (b,) of a boundary (b, 3) that are connected across edges of exactly two of its triangles."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     edges = np.sort(boundary[:, _EDGES_OF_TRIANGLE].reshape(-1, 2), axis=1)
     order, first = _group(edges, int(boundary.max(initial=0)) + 1)
     pair = first[np.diff(np.append(first, len(order))) == 2]
     one, other = order[pair] // 3, order[pair + 1] // 3
-    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(len(boundary), len(boundary)))
-    labels: IntArray = connected_components(graph, directed=False)[1].astype(np.int64)
-    return labels
+    return np.unique(label_components(one, other, len(boundary)), return_inverse=True)[1]
 
 
 def find_mesh_edges(T: IntArray) -> IntArray:
     """Return the edges (e, 2) of tetrahedra, each once, lower vertex first."""
     pairs = np.sort(T[:, EDGES].reshape(-1, 2), axis=1)
     n = int(T.max(initial=0)) + 1
-    key = np.unique(pairs[:, 0] * n + pairs[:, 1])
-    return np.stack(np.divmod(key, n), axis=1)
+    return np.stack(np.divmod(np.unique(pair_keys(pairs, n)), n), axis=1)

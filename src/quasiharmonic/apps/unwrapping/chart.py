@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.pack import find_copies
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
-from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
+from quasiharmonic.apps.unwrapping.chart_maps import NO_CUT, WorkingChart
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.geometry.mesh.reference import area_vectors
-from quasiharmonic.geometry.mesh.splitting import fans, renumber
-from quasiharmonic.geometry.mesh.topology import components
-from quasiharmonic.util.arrays import FloatArray, IntArray, scale_to_unit
+from quasiharmonic.geometry.mesh.splitting import renumber, split_parts
+from quasiharmonic.geometry.mesh.topology import components, group_by_label
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, scale_to_unit
 from quasiharmonic.util.progress import heartbeat
 
 # Areas and moments of congruent components have at most this relative difference.
@@ -66,15 +66,21 @@ class Chart:
 
     def take(self, rows: IntArray) -> list[Chart]:
         """Return the connected parts of some triangles, by their places (k,) in the chart, as charts."""
-        split, component = fans(self.F[rows])
-        parts = []
-        for number in range(int(component.max()) + 1):
-            own, corner = renumber(split[component == number], self.F[rows[component == number]])
-            some = rows[component == number]
-            origin = self.F[some].ravel()[corner]
-            found = self.triangles[some], own, self.vertices[origin], self.uv[origin], self.stretch[some]
-            parts.append(Chart(*found, self.misses, self.straight))
-        return parts
+        return [
+            replace(
+                self,
+                triangles=self.triangles[some],
+                F=own,
+                vertices=self.vertices[origin],
+                uv=self.uv[origin],
+                stretch=self.stretch[some],
+            )
+            for some, own, origin in split_parts(self.F[rows], rows, NO_CUT, len(self.uv))
+        ]
+
+    def split(self, first: BoolArray) -> list[Chart]:
+        """Return the connected parts of the triangles in a mask (k,), and those of the others, as charts."""
+        return [*self.take(np.flatnonzero(first)), *self.take(np.flatnonzero(~first))]
 
     def open(self, V: FloatArray, cost: FloatArray) -> WorkingChart:
         """Return the chart for further cuts, given positions (n, 3) and costs (f, 3) of the whole mesh."""
@@ -90,6 +96,21 @@ class Chart:
         uv = np.ldexp(working.uv, working.piece.exponent)
         missed = self.misses if (stretch > bound).any() else 0.0
         return Chart(working.triangles, working.F, working.vertices, uv, stretch, missed, self.straight)
+
+
+def cut_out_chart(
+    triangles: IntArray, split: IntArray, F: IntArray, corner_uv: FloatArray, stretch: FloatArray, misses: float = 0.0
+) -> Chart:
+    """Return triangles F (k, 3), ``split`` as by `fans`, with positions (k, 3, 2) in the plane, as a chart."""
+    own, corner = renumber(split, F)
+    return Chart(triangles, own, F.ravel()[corner], corner_uv.reshape(-1, 2)[corner], stretch, misses)
+
+
+def halve(corner_uv: FloatArray) -> BoolArray:
+    """Return a mask (k,) of one half of triangles (k, 3, 2) in the plane, along their longer extent."""
+    centre = corner_uv.mean(axis=1)
+    along = centre[:, np.argmax(np.ptp(centre, axis=0))]
+    return np.asarray(np.argsort(np.argsort(along, kind="stable")) < len(along) // 2)
 
 
 def finish_chart(chart: WorkingChart, misses: float) -> Chart:
@@ -135,10 +156,9 @@ def _number_copies(charts: list[Chart], V: FloatArray, F: IntArray) -> list[int]
     # In this unit, products neither overflow nor underflow.
     V = scale_to_unit(V)
     area, centre = np.linalg.norm(area_vectors(V, F), axis=1), V[F].mean(axis=1)
-    order = np.argsort(label, kind="stable")
     kinds = dict[int, int]()
     known = defaultdict[int, list[tuple[int, FloatArray]]](list)
-    for rows in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+    for rows in group_by_label(label):
         whole, away = area[rows].sum(), centre[rows] - centre[rows].mean(axis=0)
         moments = np.linalg.eigvalsh(np.einsum("k,ki,kj->ij", area[rows], away, away))
         measures = np.array([whole, *np.sqrt(np.maximum(moments, 0) * whole)])

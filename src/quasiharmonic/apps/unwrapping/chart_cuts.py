@@ -11,9 +11,9 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import KEPT_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.mesh.splitting import fans, renumber
-from quasiharmonic.geometry.mesh.topology import find_pairs, label_components
+from quasiharmonic.geometry.mesh.topology import find_pairs, group_by_label, label_components
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, invert_indices, mark
 
 
 class CutTuning(NamedTuple):
@@ -98,7 +98,7 @@ def divide(chart: WorkingChart, bound: float) -> list[WorkingChart]:
     if chart.uv is not None:
         there = _excess(chart, bound)
         graph.cost[:] /= 1 + _TUNING.attraction * there[graph.ends].mean(axis=1)
-    return _open(chart, _line_between(chart, graph, *_far_ends(chart, graph))[graph.side].T)
+    return _open(chart, _line_between(chart, graph, *_far_ends(graph))[graph.side].T)
 
 
 def _excess(chart: WorkingChart, bound: float) -> FloatArray:
@@ -133,17 +133,14 @@ def _overlapping_parts(chart: WorkingChart) -> tuple[IntArray, IntArray]:
     vertices, the one that parts most crossings is used, and of several the longest.
     """
     loop = np.concatenate(chart.piece.loops)
-    place = np.empty(len(chart.V), dtype=np.int64)
-    place[loop] = np.arange(loop.size)
-    pairs = place[chart.crossings[:, (0, 2)]]
+    pairs = invert_indices(len(chart.V), loop)[chart.crossings[:, (0, 2)]]
     count = min(loop.size, _TUNING.samples)
     bins = pairs * count // loop.size
     crossed = np.zeros((count, count))
     np.add.at(crossed, (bins[:, 0], bins[:, 1]), 1)
     np.add.at(crossed, (bins[:, 1], bins[:, 0]), 1)
     # Sums over all arcs from sample i up to before sample j.
-    both = np.zeros((count + 1, count + 1))
-    both[1:, 1:] = crossed.cumsum(axis=0).cumsum(axis=1)
+    both = np.pad(crossed.cumsum(axis=0).cumsum(axis=1), [(1, 0), (1, 0)])
     ends = np.arange(count + 1)
     i, j = (ends[:, None], ends[None, :])
     inside = both[j, j] - both[i, j] - both[j, i] + both[i, i]
@@ -178,7 +175,7 @@ def _line_from(chart: WorkingChart, graph: EdgeGraph, one: int, other: int) -> B
     return line & ~graph.rim
 
 
-def _far_ends(chart: WorkingChart, graph: EdgeGraph) -> tuple[IntArray, IntArray]:
+def _far_ends(graph: EdgeGraph) -> tuple[IntArray, IntArray]:
     """Two vertices of a chart that are far from each other."""
     ends = [0]
     for _ in range(3):
@@ -223,20 +220,13 @@ def _line_between(chart: WorkingChart, graph: EdgeGraph, one: IntArray, other: I
     apart = a != b
     a, b, capacity = a[apart], b[apart], capacity[apart]
     size = numbers.size
-    network = csr_array(
-        (np.concatenate([capacity, capacity]), (np.concatenate([a, b]), np.concatenate([b, a]))),
-        shape=(size, size),
-        dtype=np.int32,
-    )
-    network.sum_duplicates()
+    one_way = csr_array((capacity, (a, b)), shape=(size, size))
+    network = one_way + one_way.T
     flow = maximum_flow(network, size - 2, size - 1).flow
-    rest = (network - flow).tocsr()
-    rest.data[rest.data < 0] = 0
-    rest.eliminate_zeros()
+    rest = (network - flow).maximum(0)
     reached = mark(size, breadth_first_order(rest, size - 2, return_predecessors=False))
     side = reached[node[:k]]
-    line = mark(len(graph.ends), edge[side[first] != side[second]])
-    return line
+    return mark(len(graph.ends), edge[side[first] != side[second]])
 
 
 def group_undivided(F: IntArray, cost: FloatArray, least: float = UNDIVIDED_COST) -> IntArray:
@@ -263,8 +253,7 @@ def _open(chart: WorkingChart, cut: BoolArray) -> list[WorkingChart]:
     """Open a chart at sides (k, 3) of its triangles; return its parts, which keep the map."""
     split, component = fans(chart.F, cut)
     parts = []
-    for number in range(int(component.max()) + 1):
-        rows = np.flatnonzero(component == number)
+    for rows in group_by_label(component):
         own, corner = renumber(split[rows], chart.F[rows])
         origin = chart.F[rows].ravel()[corner]
         part = WorkingChart(chart.triangles[rows], chart.vertices[origin], chart.V[origin], own, chart.cost[rows])

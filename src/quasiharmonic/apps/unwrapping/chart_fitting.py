@@ -6,19 +6,20 @@ that close to each other. A single triangle can always be stored.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart, halve
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, divide_overlap, group_undivided, is_undivided
 from quasiharmonic.apps.unwrapping.chart_maps import WORST_STRETCH
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
 from quasiharmonic.apps.unwrapping.layout import GRID_UNIT, ChartLayout, grid_unit
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
+from quasiharmonic.util.options import UnwrapOptions
 from quasiharmonic.util.progress import heartbeat
 
 # Enlarged triangles are at least this number of units high. Rounding can invert triangles that are lower than the
@@ -63,12 +64,9 @@ def divide_long_charts(
     V: FloatArray,
     cost: FloatArray,
     *,
-    bound: float,
+    wanted: UnwrapOptions,
     size: tuple[int, int],
-    tiles: int,
-    max_charts: int | None,
-    for_packing: bool = False,
-    density: float | None = None,
+    density: float | None,
 ) -> list[Chart]:
     """Divide charts across their middle until each fits into a texture that the charts cover well.
 
@@ -81,17 +79,12 @@ def divide_long_charts(
         Vertices of the mesh.
     cost : (f, 3) float64
         Factors on the cost of seams; see `find_charts`.
-    bound : float
-        Bound on the stretch.
+    wanted : UnwrapOptions
+        With ``divide_for_packing``, charts without stretch and rectangles are divided like the others, and not only
+        where they are too long.
     size : two int
         Width and height of the texture.
-    tiles : int
-        Number of textures.
-    max_charts : int or None
-        Maximum number of charts.
-    for_packing : bool
-        Whether charts without stretch and rectangles are divided like the others, and not only where they are too long.
-    density : float, optional
+    density : float or None
         Texels per unit of length, if they are given.
 
     Returns
@@ -99,41 +92,40 @@ def divide_long_charts(
     list of Chart
         Ordered by first triangle.
     """
+    for_packing = wanted.divide_for_packing
     area = sum(chart.shape.area for chart in charts)
     ratio = max(size) / min(size)
-    side = float(np.sqrt(area * ratio / (_TUNING.expected_use * tiles)))
+    side = float(np.sqrt(area * ratio / (_TUNING.expected_use * wanted.tiles)))
     longest_flat = _TUNING.longest_flat * side
     if density is not None:
         side = min(side, max(size) / density)
         longest_flat = min(longest_flat, max(size) / density)
+
+    def divide_long(chart: Chart, count: int) -> list[Chart]:
+        full = wanted.max_charts is not None and count >= wanted.max_charts
+        if full or len(chart.F) < 2 or not _is_too_long(chart, side, area, for_packing):
+            return []
+        if _is_fixed(chart, for_packing):
+            parts = _halve(chart, cost)
+            return parts or (_halve(chart, cost / UNDIVIDED_COST) if max(chart.shape.sides) > longest_flat else [])
+        working, bound = chart.open(V, cost), float(wanted.max_stretch)
+        return [] if is_undivided(working) else [chart.part(part, bound) for part in divide(working, bound)]
+
+    return _divide_each(charts, divide_long)
+
+
+def _divide_each(charts: Sequence[Chart], parts_of: Callable[[Chart, int], list[Chart]]) -> list[Chart]:
+    """Divide charts and their parts as long as ``parts_of``, given a chart and the number of charts, has parts."""
     done: list[Chart] = []
     waiting = list(charts)
     while waiting:
         heartbeat()
         chart = waiting.pop()
-        full = max_charts is not None and len(done) + len(waiting) + 1 >= max_charts
-        if full or len(chart.F) < 2 or not _is_too_long(chart, side, area, for_packing):
-            done.append(chart)
-            continue
-        if _is_fixed(chart, for_packing):
-            parts = _halve(chart, cost)
-            if not parts and _length(chart) > longest_flat:
-                parts = _halve(chart, cost / UNDIVIDED_COST)
-        else:
-            parts = _divide_across(chart, V, cost, bound)
-        if parts:
-            waiting += parts
-        else:
+        parts = parts_of(chart, len(done) + len(waiting) + 1)
+        waiting += parts
+        if not parts:
             done.append(chart)
     return sorted(done, key=lambda chart: int(chart.triangles[0]))
-
-
-def _divide_across(chart: Chart, V: FloatArray, cost: FloatArray, bound: float) -> list[Chart]:
-    """Divide a chart across its middle; return no parts if it should stay whole."""
-    working = chart.open(V, cost)
-    if is_undivided(working):
-        return []
-    return [chart.part(part, bound) for part in divide(working, bound)]
 
 
 def _halve(chart: Chart, cost: FloatArray) -> list[Chart]:
@@ -141,38 +133,29 @@ def _halve(chart: Chart, cost: FloatArray) -> list[Chart]:
 
     Triangles with sides that are too dear to cut stay together.
     """
-    shape = chart.shape
-    width, height = shape.extent(shape.direction)
-    along = shape.direction if width >= height else 1j * shape.direction
-    at = (chart.uv @ [1, 1j] / along).real
+    at = (chart.uv @ [1, 1j] / chart.shape.lying).real
     group = group_undivided(chart.F, cost[chart.triangles])
     middle = np.bincount(group, at[chart.F].mean(axis=1)) / np.maximum(np.bincount(group), 1)
     first = middle[group] < (at.min() + at.max()) / 2
     if first.all() or not first.any():
         return []
-    parts = [part for rows in (np.flatnonzero(first), np.flatnonzero(~first)) for part in chart.take(rows)]
-    return parts if max(map(_length, parts)) <= _TUNING.shorter * _length(chart) else []
+    parts = chart.split(first)
+    return parts if max(max(part.shape.sides) for part in parts) <= _TUNING.shorter * max(chart.shape.sides) else []
 
 
 def _is_too_long(chart: Chart, side: float, area: float, for_packing: bool) -> bool:
     """Whether a chart prevents a scale at which the texture has this side."""
     if _is_fixed(chart, for_packing):
         longest = _TUNING.longest_alone if chart.shape.area > _TUNING.alone * area else _TUNING.longest_fixed
-        return _length(chart) > longest * side
-    shape = chart.shape
-    width, height = shape.extent(shape.direction)
-    loose = shape.area < _TUNING.loose * width * height
+        return max(chart.shape.sides) > longest * side
+    width, height = chart.shape.sides
+    loose = chart.shape.area < _TUNING.loose * width * height
     return max(width, height) > side * (_TUNING.longest_loose if loose else _TUNING.longest)
 
 
 def _is_fixed(chart: Chart, for_packing: bool) -> bool:
     """Whether a chart is divided only where it is too long for the texture."""
     return (chart.isometric or chart.straight) and not for_packing
-
-
-def _length(chart: Chart) -> float:
-    """Longer side of a chart's box."""
-    return max(chart.shape.extent(chart.shape.direction))
 
 
 def divide_fragile(charts: Sequence[Chart], V: FloatArray, cost: FloatArray, *, bound: float) -> list[Chart]:
@@ -183,17 +166,14 @@ def divide_fragile(charts: Sequence[Chart], V: FloatArray, cost: FloatArray, *, 
     """
     area = sum(chart.shape.area for chart in charts)
     unit = _COARSER * float(np.sqrt(area / _TUNING.expected_use)) * GRID_UNIT
-    done: list[Chart] = []
-    waiting = list(charts)
-    while waiting:
-        heartbeat()
-        chart = waiting.pop()
+
+    def divide_damaged(chart: Chart, _: int) -> list[Chart]:
         verdict = certify(chart.F, np.rint(chart.uv / unit))
         if verdict.bijective or len(chart.F) == 1:
-            done.append(chart)
-        else:
-            waiting += _divide_faulty(chart, verdict, np.zeros(len(chart.F), dtype=bool), V, cost, bound)
-    return sorted(done, key=lambda chart: int(chart.triangles[0]))
+            return []
+        return _divide_faulty(chart, verdict, mark(len(chart.F)), V, cost, bound)
+
+    return _divide_each(charts, divide_damaged)
 
 
 def mend_charts(
@@ -251,8 +231,7 @@ def _divide_faulty(
     chart: Chart, verdict: Certificate, low: BoolArray, V: FloatArray, cost: FloatArray, bound: float
 ) -> list[Chart]:
     """Divide a chart so that triangles with faults are in charts of their own; ``low`` (k,) are triangles at risk."""
-    bad = np.zeros(len(chart.F), dtype=bool)
-    bad[verdict.inverted], bad[verdict.degenerate] = True, True
+    bad = mark(len(chart.F), verdict.inverted, verdict.degenerate)
     bad |= np.isin(chart.F, verdict.multiply_wound).any(axis=1)
     if len(verdict.crossings) and not bad.any():
         working = chart.open(V, cost)
@@ -262,10 +241,8 @@ def _divide_faulty(
             return [chart.part(one, bound) for one in parts]
     bad |= low & bad.any()
     if bad.all() or not bad.any():
-        along = chart.uv[chart.F].mean(axis=1)
-        along = along[:, np.argmax(np.ptp(along, axis=0))]
-        bad = np.argsort(np.argsort(along, kind="stable")) < len(along) // 2
-    return [part for rows in (np.flatnonzero(bad), np.flatnonzero(~bad)) for part in chart.take(rows)]
+        bad = halve(chart.uv[chart.F])
+    return chart.split(bad)
 
 
 def _enlarge(chart: Chart, factor: float, V: FloatArray, cost: FloatArray) -> Chart:
@@ -294,5 +271,4 @@ def _heights(corners: FloatArray) -> FloatArray:
     """Return the smallest height (k,) of each triangle (k, 3, 2)."""
     sides = np.roll(corners, -1, axis=1) - corners
     twice = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
-    heights: FloatArray = twice / np.linalg.norm(sides, axis=2).max(axis=1)
-    return heights
+    return np.asarray(twice / np.linalg.norm(sides, axis=2).max(axis=1))

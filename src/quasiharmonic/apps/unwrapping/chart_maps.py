@@ -35,6 +35,8 @@ WORST_STRETCH = 3.0
 THIN_ANGLE = np.pi / 180
 #: Share of the area that may be stretched beyond the bound.
 FREE_SHARE = 0.01
+#: No edges (0, 2), for `split_parts`.
+NO_CUT = np.empty((0, 2), dtype=np.int64)
 
 
 class ChartTuning(NamedTuple):

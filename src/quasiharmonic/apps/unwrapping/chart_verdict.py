@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from quasiharmonic.apps.atlas.atlas_verdict import AtlasVerdict, certify
-from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
+from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean, turn_corners
 from quasiharmonic.apps.unwrapping.layout import ChartLayout
 from quasiharmonic.geometry.curves.arcs import nearest_on_segments
 from quasiharmonic.geometry.exact import certificate
@@ -22,8 +22,8 @@ from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.exact.loops import LoopEdges, Obstacle
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_twins, group_by_label, label_components
 from quasiharmonic.io.seamed_mesh import SeamedMesh
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of, repeat_each
-from quasiharmonic.util.outcome import Verdict
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, as_offsets, count_of, mark, names_of
+from quasiharmonic.util.outcome import Verdict, as_plain
 
 # Largest distance between the boxes of stacked charts, in sides of the texture. Congruent charts may differ by a share
 # of 1e-4 of their radius.
@@ -104,12 +104,9 @@ class UnwrapCertificate(Verdict):
         """Return the verdict for JSON."""
         return {
             **super().to_dict(),
-            "injective": self.injective,
-            "disjoint": self.disjoint,
+            **as_plain(self, "injective", "disjoint"),
             "not_bijective_charts": np.flatnonzero(~self.bijective_charts).tolist(),
-            "inverted": self.inverted.tolist(),
-            "degenerate": self.degenerate.tolist(),
-            "overlapping": self.overlapping.tolist(),
+            **as_plain(self, "inverted", "degenerate", "overlapping"),
             "clearance": self.clearance if np.isfinite(self.clearance) else None,
         }
 
@@ -163,10 +160,9 @@ def _rank_in_stack(uv: FloatArray, chart: IntArray) -> IntArray:
     )
     pairs = cKDTree(boxes).query_pairs(_SAME_PLACE, output_type="ndarray").astype(np.int64)
     label = label_components(pairs[:, 0], pairs[:, 1], len(boxes))
-    by_label = np.argsort(label, kind="stable")
-    first = np.flatnonzero(np.diff(label[by_label], prepend=-1))
-    rank = np.empty(len(boxes), dtype=np.int64)
-    rank[by_label] = np.arange(len(boxes)) - repeat_each(first, np.diff(first, append=len(boxes)))
+    rank = np.zeros(len(boxes), dtype=np.int64)
+    for group in group_by_label(label):
+        rank[group] = np.arange(group.size)
     return rank
 
 
@@ -203,13 +199,8 @@ def measure_clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vert
         i, j = i[apart], j[apart]
         for start in range(0, i.size, 1 << 16):
             one, other = i[start : start + (1 << 16)], j[start : start + (1 << 16)]
-            for a, b, c in (
-                (p[one], p[other], q[other]),
-                (q[one], p[other], q[other]),
-                (p[other], p[one], q[one]),
-                (q[other], p[one], q[one]),
-            ):
-                least = min(least, float(nearest_on_segments(a, b, c)[1].min()))
+            for a, b, ends in ((one, other, p), (one, other, q), (other, one, p), (other, one, q)):
+                least = min(least, float(nearest_on_segments(ends[a], p[b], q[b])[1].min()))
     return least if least <= reach else np.inf
 
 
@@ -226,11 +217,7 @@ class SetApart:
 
     def to_dict(self) -> dict[str, list[int]]:
         """Return the triangles for JSON."""
-        return {
-            "reversed_triangles": self.reversed.tolist(),
-            "repeated_triangles": self.repeated.tolist(),
-            "degenerate_triangles": self.degenerate.tolist(),
-        }
+        return {f"{kind}_triangles": found.tolist() for kind, found in vars(self).items()}
 
     def summary(self) -> str:
         """Return one line for each kind."""
@@ -279,7 +266,7 @@ def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tupl
     preferred = np.zeros(len(F), dtype=np.int64)
     preferred[cleaned.triangles] = np.where(cleaned.flipped, -1, 1)
     turned = _orient(G, len(keys), preferred[rows])
-    G[turned] = G[turned][:, (0, 2, 1)]
+    G = turn_corners(G, turned)
     points, uv = V[F[rows].ravel()[first]], places[pairs[keys] % len(places)]
     verdict = certify(SeamedMesh(points, G, G, uv))
     # A texture is mirrored if `unwrap` treated an inside-out model as turned outward.
@@ -346,5 +333,4 @@ def _orient(F: IntArray, n: int, preferred: IntArray) -> BoolArray:
     label = label_components(np.concatenate([one, one + 1]), np.concatenate([other, other ^ 1]), 2 * len(F))
     chart, odd = label[::2] // 2, label[::2] % 2 == 1
     votes = np.bincount(chart, np.where(odd, -preferred, preferred), len(F))
-    turned: BoolArray = (odd ^ (votes < 0)[chart]) & (label[::2] != label[1::2])
-    return turned
+    return np.asarray((odd ^ (votes < 0)[chart]) & (label[::2] != label[1::2]))

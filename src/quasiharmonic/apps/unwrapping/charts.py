@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,7 +46,6 @@ def find_charts(
     choose: LayoutChoice | None = None,
     mirror: Mirror | None = None,
     draft: Draft | None = None,
-    seed: int = 0,
     callback: Callable[[str, int, int], object] | None = None,
     jobs: int | None = None,
 ) -> list[Chart]:
@@ -85,8 +83,6 @@ def find_charts(
         crosses the plane, or the seams there would grow by more than a quarter.
     draft : Draft, optional
         Gets the charts so far, in case that a time limit ends the search.
-    seed : int
-        Unused: the search has no random choices.
     callback : callable, optional
         Called with the phase, the number of finished parts and the number of all parts; may raise an exception.
     jobs : int, optional
@@ -111,11 +107,21 @@ def find_charts(
         working, rest = _keep_parts(V, F, np.flatnonzero(~exact), given, cost, uv)
     min_gain = _MIN_GAIN if uv_cuts is None else np.inf
     coarse = uv_cuts is None and max_charts is None and not given.size
-    make_search = partial(CoarseSearch, max_stretch, min_gain, workers) if coarse else None
-    cut = partial(_cut, V, F, given=given, cost=cost, min_gain=min_gain, make_search=make_search)
     draft.charts = [*charts]
     total = surface_area(V, F)
     divisible = None if max_charts is None else max_charts - len(charts)
+
+    def cut(some: IntArray) -> list[WorkingChart]:
+        """Cut triangles into disks, or a large surface into charts."""
+        at_sides = given[are_sides(given, F[some], len(V))]
+        vertices = np.flatnonzero(mark(len(V), F[some]))
+        own = invert_indices(len(V), vertices)[F[some]]
+        points, gain = V[vertices], min_gain if len(at_sides) else _MIN_GAIN
+        search = CoarseSearch(max_stretch, min_gain, workers, points) if coarse else None
+        found = cut_into_charts(points, own, np.searchsorted(vertices, at_sides), cost[some], gain, search)
+        for chart in found:
+            chart.triangles, chart.vertices = some[chart.triangles], vertices[chart.vertices]
+        return found
 
     def search(parts: list[WorkingChart], most: int | None, share: float) -> list[Chart]:
         found = search_charts(
@@ -176,23 +182,13 @@ def _develop(
     rows = np.flatnonzero(~mask)
     if not rows.size:
         return mask, charts
-    developed, more = develop_charts(
-        V,
-        F[rows],
-        cost[rows],
-        choose,
-        workers.check_wanted,
-        None if mirror is None else mirror.select(rows),
-    )
-    if max_charts is None or _count_components(F[rows[~developed]]) <= max_charts - len(charts) - len(more):
+    own_mirror = None if mirror is None else mirror.select(rows)
+    developed, more = develop_charts(V, F[rows], cost[rows], choose, workers.check_wanted, own_mirror)
+    left = np.inf if max_charts is None else max_charts - len(charts) - len(more)
+    if int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1 <= left:
         charts += [replace(chart, triangles=rows[chart.triangles]) for chart in more]
         mask[rows[developed]] = True
     return mask, charts
-
-
-def _count_components(F: IntArray) -> int:
-    """Number of the surfaces that triangles (k, 3) form."""
-    return int(fans(F)[1].max(initial=-1)) + 1
 
 
 def _lay_flat(V: FloatArray, F: IntArray, cut: IntArray) -> tuple[BoolArray, list[Chart]]:
@@ -242,31 +238,6 @@ def _try_map(chart: WorkingChart, corner_uv: FloatArray) -> None:
         chart.use(uv)
         if not chart.bijective or chart.too_long.any():
             chart.uv = None
-
-
-def _cut(
-    V: FloatArray,
-    F: IntArray,
-    rows: IntArray,
-    given: IntArray,
-    cost: FloatArray,
-    min_gain: float,
-    make_search: Callable[[FloatArray], CoarseSearch] | None,
-) -> list[WorkingChart]:
-    """Cut triangles into disks, or with ``make_search`` large surfaces into charts.
-
-    ``given`` cuts are demanded.
-    """
-    n = len(V)
-    there = given[are_sides(given, F[rows], n)]
-    vertices = np.flatnonzero(mark(n, F[rows]))
-    own = invert_indices(n, vertices)[F[rows]]
-    points, gain = V[vertices], min_gain if len(there) else _MIN_GAIN
-    coarse = None if make_search is None else make_search(points)
-    charts = cut_into_charts(points, own, np.searchsorted(vertices, there), cost[rows], gain, coarse)
-    for chart in charts:
-        chart.triangles, chart.vertices = rows[chart.triangles], vertices[chart.vertices]
-    return charts
 
 
 def _finish(charts: list[WorkingChart], bound: float, total: float) -> list[Chart]:

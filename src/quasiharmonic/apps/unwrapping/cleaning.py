@@ -22,6 +22,7 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_weld,
     count_of,
+    invert_indices,
     mark,
     number_array,
     triangle_array,
@@ -155,6 +156,10 @@ class CleanedMesh:
         """Return a table of the changes with the first elements of each class; empty if nothing changes."""
         return "\n".join(tabulate_elements("change", self.changes))
 
+    def take_corners(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Return values at the corners of the cleaned triangles, given those of all triangles of the model."""
+        return turn_corners(values[self.triangles], self.flipped)
+
     def restore_corners(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
         """Return values at the corners of all triangles of the model, such as indices of texture coordinates.
 
@@ -173,9 +178,7 @@ class CleanedMesh:
         if values.shape[:2] != self.F.shape:
             raise ValueError(f"values must have shape {self.F.shape} or more dimensions, not {values.shape}")
         restored = np.empty((self.report.triangles, *values.shape[1:]), dtype=values.dtype)
-        restored[self.triangles] = values
-        turned = self.triangles[self.flipped]
-        restored[turned] = restored[turned][:, (0, 2, 1)]
+        restored[self.triangles] = turn_corners(values, self.flipped)
         restored[self.excluded] = values[self.substitutes[:, None], self.substitute_corners]
         return restored
 
@@ -265,7 +268,7 @@ def clean(
     number, vertices = _number(sheets.fan, corners)
     positions, moved = V[joint[vertices]], moved[joint[vertices]]
     positions[moved] = np.ldexp(points[joint[vertices[moved]], : V.shape[1]], exponent)
-    component, facing = _orientations(points[joint[vertices]], _turn(number, sheets.turned))
+    component, facing = _orientations(points[joint[vertices]], turn_corners(number, sheets.turned))
     flipped = sheets.turned
     if outward:
         flipped = flipped ^ (facing < 0)[component]
@@ -274,10 +277,10 @@ def clean(
     distinct = np.flatnonzero(mark(len(V), joint[corners]))
     return CleanedMesh(
         V=positions,
-        F=_turn(number, flipped),
+        F=turn_corners(number, flipped),
         vertices=vertices,
         triangles=rows,
-        corners=_turn(corners, flipped),
+        corners=turn_corners(corners, flipped),
         flipped=flipped,
         widened=thin[rows],
         moved=moved,
@@ -302,9 +305,7 @@ def _number(fan: IntArray, corners: IntArray) -> tuple[IntArray, IntArray]:
     first = np.flatnonzero(label == np.arange(label.size))
     owner = corners.ravel()[first]
     order = np.argsort(owner, kind="stable")
-    number = np.empty(label.size, dtype=np.int64)
-    number[first[order]] = np.arange(first.size)
-    return number[fan], owner[order]
+    return invert_indices(label.size, first[order])[fan], owner[order]
 
 
 def _find_edges(joint: IntArray, corners: IntArray, pairs: IntArray) -> IntArray:
@@ -318,11 +319,11 @@ def _find_edges(joint: IntArray, corners: IntArray, pairs: IntArray) -> IntArray
     return np.unique(np.sort(ends, axis=1), axis=0)
 
 
-def _turn(F: IntArray, turned: BoolArray) -> IntArray:
-    """Return triangles, some of them reversed."""
-    F = F.copy()
-    F[turned] = F[turned][:, (0, 2, 1)]
-    return F
+def turn_corners(values: NDArray[Scalar], turned: BoolArray) -> NDArray[Scalar]:
+    """Return triangles, or values (k, 3, ...) at their corners, with some triangles reversed."""
+    values = values.copy()
+    values[turned] = values[turned][:, (0, 2, 1)]
+    return values
 
 
 def _orientations(points: FloatArray, F: IntArray) -> tuple[IntArray, IntArray]:

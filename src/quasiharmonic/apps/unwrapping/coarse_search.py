@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.flattening.worst_triangles import mark_around
-from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WorkingChart
+from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, NO_CUT, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.geometry.coarsening import Removal, has_marked_corner, mark_rings
@@ -66,7 +66,6 @@ class FitTuning(NamedTuple):
 
 
 _TUNING = FitTuning()
-_NO_CUT = np.empty((0, 2), dtype=np.int64)
 
 
 class CoarseSearch:
@@ -85,7 +84,7 @@ class CoarseSearch:
         if graph.n <= _TUNING.largest_share * len(self._V):
             coarser = CoarseSearch(self._bound, self._min_gain, self._workers, graph.V)
         found = search_charts(
-            cut_into_charts(graph.V, F, _NO_CUT, cost, self._min_gain, coarser),
+            cut_into_charts(graph.V, F, NO_CUT, cost, self._min_gain, coarser),
             self._bound,
             max_charts=None,
             total_area=surface_area(graph.V, F),
@@ -234,7 +233,7 @@ def _repair(chart: WorkingChart, uv: FloatArray) -> FloatArray | None:
         # Few surfaces need this, and it imports the whole solver.
         from quasiharmonic.solver.mapping import injective_map
 
-        for _, T, vertices in split_parts(chart.F[rows], rows, _NO_CUT, n):
+        for _, T, vertices in split_parts(chart.F[rows], rows, NO_CUT, n):
             fixed = np.flatnonzero(~loose[vertices])
             try:
                 uv[vertices] = injective_map(chart.V[vertices], T, fixed, uv[vertices[fixed]]).uv

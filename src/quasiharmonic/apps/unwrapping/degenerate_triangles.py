@@ -278,5 +278,4 @@ def _find_neighbours(points: FloatArray, F: IntArray, flat: IntArray) -> IntArra
 def _match_corners(points: FloatArray, F: IntArray, substitutes: IntArray) -> IntArray:
     """Return for each corner of F (k, 3) the nearest corner, 0 … 2, of its substitute (k, 3)."""
     apart = points[F][:, :, None] - points[substitutes][:, None]
-    nearest: IntArray = np.where(F[:, :, None] == substitutes[:, None], -1.0, (apart**2).sum(axis=3)).argmin(axis=2)
-    return nearest
+    return np.where(F[:, :, None] == substitutes[:, None], -1.0, (apart**2).sum(axis=3)).argmin(axis=2)

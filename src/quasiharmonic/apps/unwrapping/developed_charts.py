@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import convex_hull, find_smallest_box
-from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart, cut_out_chart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, ahead, find_hinges
 from quasiharmonic.apps.unwrapping.layout import MAX_COMPARED, LayoutChoice
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
@@ -22,7 +22,7 @@ from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import SAME, meet
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import surface_area
-from quasiharmonic.geometry.mesh.splitting import fans, renumber
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops, group_by_label
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_points
 
@@ -185,9 +185,7 @@ class PaperModel:
         self._watched = may_join & (one >= 0) & (other >= 0) & (one != other)
         between = np.flatnonzero(self._watched)
         low, high = np.minimum(one, other)[between], np.maximum(one, other)[between]
-        order = np.lexsort((high, low))
-        starts = np.flatnonzero(np.diff(low[order] * len(self._charts) + high[order], prepend=-1))
-        for group in np.split(order, starts[1:]) if order.size else []:
+        for group in group_by_label(low * len(self._charts) + high):
             a, b = int(low[group[0]]), int(high[group[0]])
             self._contacts[a][b] = self._contacts[b][a] = between[group]
 
@@ -364,9 +362,8 @@ class PaperModel:
             label = int(pieces.label[rows[0]])
             # A label keeps its triangles unless more are joined to them.
             if label not in known or len(known[label].triangles) != rows.size:
-                own, corner = renumber(self._split(rows), self._F[rows])
-                uv = to_points(pieces.place[rows].ravel()[corner])
-                known[label] = Chart(rows, own, self._F[rows].ravel()[corner], uv, np.ones(rows.size), 0.0)
+                uv = to_points(pieces.place[rows].ravel())
+                known[label] = cut_out_chart(rows, self._split(rows), self._F[rows], uv, np.ones(rows.size))
             charts.append(known[label])
         return charts
 

@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart, mirror_charts
+from quasiharmonic.apps.unwrapping.chart import Chart, cut_out_chart, finish_chart, halve, mirror_charts
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WORST_STRETCH, WorkingChart, keeps_bound
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
 from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import covers_once
-from quasiharmonic.geometry.mesh.splitting import fans, renumber
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import edge_keys, find_pairs, label_components, mark_sides
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_exponent
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_exponent, mark
 
 # Largest and smallest bound in radians on the angle between a triangle and the plane of its chart.
 _MOST_INCLINED, _LEAST_INCLINED = np.pi / 3, 1e-3
@@ -143,14 +143,11 @@ def grow_charts(
         order = np.argsort(component, kind="stable")
         for k, some in enumerate(np.split(order, np.cumsum(size)[:-1])):
             if good[k]:
-                own, corner = renumber(split[some], triangles[some])
-                uv_of = np.ldexp(uv[some].reshape(-1, 2)[corner], exponent)
                 missed = _find_excess(stretch[some], cross[left[some]], max(bound, 1 / np.cos(_LEAST_INCLINED)))
-                charts.append(
-                    Chart(rows[left[some]], own, triangles[some].ravel()[corner], uv_of, stretch[some], missed)
-                )
+                found = rows[left[some]], split[some], triangles[some], np.ldexp(uv[some], exponent)
+                charts.append(cut_out_chart(*found, stretch[some], missed))
             else:
-                label[left[some]] = 2 * k + (steep[some] if 0 < steep[some].sum() < some.size else _halve(uv[some]))
+                label[left[some]] = 2 * k + (steep[some] if 0 < steep[some].sum() < some.size else halve(uv[some]))
         left = left[~good[component]]
     return charts
 
@@ -274,8 +271,7 @@ def _rank(label: IntArray) -> IntArray:
 
 def _sum_rows(values: FloatArray, label: IntArray) -> FloatArray:
     """Return the sums (c, 3) of the rows of values (k, 3) with each label."""
-    sums: FloatArray = np.stack([np.bincount(label, column) for column in values.T], axis=1)
-    return sums
+    return np.stack([np.bincount(label, column) for column in values.T], axis=1)
 
 
 def _project(corners: FloatArray, cross: FloatArray, component: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -302,23 +298,10 @@ def _scale_to_one(vectors: FloatArray) -> FloatArray:
 
 def _angles(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the angles (k,) between unit vectors (k, 3)."""
-    angle: FloatArray = 2 * np.arcsin(np.minimum(np.linalg.norm(a - b, axis=1) / 2, 1.0))
-    return angle
+    return np.asarray(2 * np.arcsin(np.minimum(np.linalg.norm(a - b, axis=1) / 2, 1.0)))
 
 
 def _differ(F: IntArray, label: IntArray) -> BoolArray:
     """Return the sides (k, 3) between triangles with different labels."""
     one, other = find_pairs(F)
-    apart = label[one // 3] != label[other // 3]
-    sides = np.zeros(F.size, dtype=bool)
-    sides[one[apart]] = True
-    return sides.reshape(-1, 3)
-
-
-def _halve(uv: FloatArray) -> BoolArray:
-    """Return one half of triangles (k, 3, 2), along their longer extent."""
-    centre = uv.mean(axis=1)
-    along = centre[:, np.argmax(np.ptp(centre, axis=0))]
-    rank = np.argsort(np.argsort(along, kind="stable"))
-    half: BoolArray = rank < len(along) // 2
-    return half
+    return mark(F.size, one[label[one // 3] != label[other // 3]]).reshape(-1, 3)

@@ -80,8 +80,7 @@ class Hinges:
 
     def touch(self, sides: BoolArray) -> BoolArray:
         """Return the hinges (e,) with one or both of their sides among some sides (f, 3)."""
-        chosen: BoolArray = sides.ravel()[self.one] | sides.ravel()[self.other]
-        return chosen
+        return np.asarray(sides.ravel()[self.one] | sides.ravel()[self.other])
 
     def mark_sides(self, chosen: BoolArray, count: int) -> BoolArray:
         """Return a mask (count, 3) of the sides of chosen hinges (e,), given the number of triangles."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from quasiharmonic.apps.atlas.packing.bitmap_search import Textures
 from quasiharmonic.apps.atlas.packing.layout import estimate_use
 from quasiharmonic.apps.atlas.packing.pack import Packing
 from quasiharmonic.apps.unwrapping.chart import Chart
@@ -71,17 +72,13 @@ class LayoutChoice:
     ----------
     divide : callable
         Divides long charts, given positions (n, 3) and costs (f, 3) of the surface.
-    size, padding, tiles, rotate
-        See `pack_charts`.
+    into : Textures
     loss : float
         By which the use of the texture may be below the best one for the sake of fewer charts.
     """
 
     divide: Callable[[list[Chart], FloatArray, FloatArray], list[Chart]]
-    size: tuple[int, int]
-    padding: float
-    tiles: int
-    rotate: bool
+    into: Textures
     loss: float
 
     @property
@@ -108,7 +105,7 @@ class LayoutChoice:
             covered = 0.0
             if len(charts) <= MAX_COMPARED:
                 shapes, above = [chart.shape for chart in charts], max(use + self.loss, 0.0)
-                covered = estimate_use(shapes, self.size, self.padding, self.tiles, rotate=self.rotate, above=above)
+                covered = estimate_use(shapes, self.into, above=above)
             if use < 0 or covered > use + self.loss:
                 chosen, use = charts, covered
             if use >= _GOOD_USE - self.loss:
@@ -186,8 +183,7 @@ def round_positions(F: IntArray, uv: FloatArray) -> FloatArray:
         wrong = np.flatnonzero(_twice_areas(grid[F]) <= 0)
         if not 0 < wrong.size <= _MOST or not _repair(F, grid, wrong):
             break
-    rounded: FloatArray = grid.astype(np.float64) * unit
-    return rounded
+    return np.asarray(grid.astype(np.float64) * unit)
 
 
 def grid_unit(uv: FloatArray) -> float:
@@ -239,5 +235,4 @@ class _Incidence:
 def _twice_areas(corners: IntArray) -> IntArray:
     """Return twice the signed areas (...) of triangles (..., 3, 2) with integer positions, exactly."""
     a, b = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
-    twice: IntArray = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return twice
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -15,7 +15,7 @@ from quasiharmonic.geometry.mesh.splitting import find_representatives
 from quasiharmonic.geometry.mesh.topology import edge_keys, mark_sides
 from quasiharmonic.io.models.appearance import label_materials
 from quasiharmonic.io.models.meshdata import MeshData, normals_of
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_exponent, mark, pad_to_space
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_exponent, first_equal, mark, pad_to_space
 
 C = TypeVar("C", bound=Callable[..., Any])
 
@@ -53,8 +53,7 @@ def statement_labels(mesh: MeshData, *keywords: str) -> IntArray:
     The keywords are those of OBJ files: ``o`` and ``g`` for groups, ``usemtl`` for materials.
     """
     columns = [label_statements(mesh, keyword)[0] for keyword in keywords]
-    number: IntArray = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
-    return number
+    return first_equal(np.stack(columns, axis=1))
 
 
 def label_statements(mesh: MeshData, keyword: str) -> tuple[IntArray, dict[bytes, int]]:
@@ -78,14 +77,11 @@ def material_densities(mesh: MeshData, result: UnwrapResult) -> dict[str, float]
     # In this unit, squares neither overflow nor underflow.
     exponent = find_exponent(mesh.V)
     area = np.linalg.norm(area_vectors(np.ldexp(mesh.V, -exponent), mesh.F), axis=1)
-    sums = [np.zeros(len(names)), np.zeros(len(names))]
-    for total, values in zip(sums, (texels, area), strict=True):
-        np.add.at(total, label[measured], values[measured])
-    found: dict[str, list[float]] = {}
-    for name, one, other in zip(names, *sums, strict=True):
-        if name is not None and other > 0:
-            pair = found.setdefault(name, [0.0, 0.0])
-            pair[0], pair[1] = pair[0] + float(one), pair[1] + float(other)
+    sums = [np.bincount(label[measured], values[measured], len(names)) for values in (texels, area)]
+    found: dict[str, FloatArray] = {}
+    for name, pair in zip(names, np.stack(sums, axis=1), strict=True):
+        if name is not None and pair[1] > 0:
+            found[name] = found.get(name, 0.0) + pair
     return {name: float(np.ldexp((one / other) ** 0.5, -exponent)) for name, (one, other) in found.items()}
 
 
@@ -98,12 +94,9 @@ def add_map(mesh: MeshData, result: UnwrapResult) -> tuple[MeshData, int]:
     if (result.cleaned.representatives < np.arange(len(mesh.V))).any():
         chart = np.empty(len(vt))
         chart[FT] = result.charts[:, None]
-        _, first, which = np.unique(np.column_stack([chart, vt]), axis=0, return_index=True, return_inverse=True)
-        # Rows keep their order.
-        order = np.argsort(first)
-        number = np.empty(len(order), dtype=np.int64)
-        number[order] = np.arange(len(order))
-        vt, FT = vt[first[order]], number[which.reshape(-1)][FT]
+        first = first_equal(np.column_stack([chart, vt]))
+        kept = np.unique(first)
+        vt, FT = vt[kept], np.searchsorted(kept, first)[FT]
     return divide_polygons(replace(mesh, vt=vt, FT=FT))
 
 

@@ -15,12 +15,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
-from quasiharmonic.apps.unwrapping.unrolling import covers_once, lay_along, meet, spanning_links
+from quasiharmonic.apps.unwrapping.unrolling import covers_once, find_forest, lay_along, meet
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes, surface_area
 from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at
 from quasiharmonic.util.progress import heartbeat
 
 #: Edges with a larger angle between the normals are creases. Those of a cylinder with twelve sides, 30°, are not.
@@ -103,7 +103,7 @@ class _Parts:
     """Parts of a surface (f, 3) whose triangles are connected by joined hinges (e,)."""
 
     def __init__(self, F: IntArray, hinges: Hinges, joined: BoolArray, angles: FloatArray, area: FloatArray) -> None:
-        self.joined = joined
+        self.F, self.hinges, self.joined = F, hinges, joined
         open_sides = ~hinges.mark_sides(joined, len(F))
         self.split, self.component = fans(F, pairs=(hinges.one[joined], hinges.other[joined]))
         self.count = int(self.component.max(initial=-1)) + 1
@@ -130,7 +130,7 @@ class _Parts:
         rough = np.bincount(part[corner], (rounded | (around >= _TUNING.many_pieces))[corner], self.count)
         self.rough = rough > _TUNING.rough * np.bincount(part[corner], minlength=self.count)
 
-    def find_cut(self, hinges: Hinges, k: int, here: IntArray, cost: FloatArray) -> IntArray:
+    def find_cut(self, k: int, here: IntArray, cost: FloatArray) -> IntArray:
         """Return the cheapest cut among hinges ``here`` of part ``k`` that gives a disk, its apexes on the boundary."""
         rows = np.flatnonzero(self.component == k)
         names, own = np.unique(self.split[rows], return_inverse=True)
@@ -138,7 +138,7 @@ class _Parts:
         terminal = np.full(len(names), -1)
         for number, loop in enumerate(loops):
             terminal[loop] = number
-        side = hinges.one[here]
+        side = self.hinges.one[here]
         ends = np.stack([self.split.ravel()[side], np.roll(self.split, -1, axis=1).ravel()[side]], axis=1)
         apexes = np.searchsorted(names, np.intersect1d(self.apexes, names))
         return _find_cut(np.searchsorted(names, ends), cost, terminal, apexes)
@@ -154,8 +154,9 @@ def _cut_costs(hinges: Hinges, cost: FloatArray, image: IntArray | None) -> Floa
     return dear
 
 
-def _drop_scattered(hinges: Hinges, parts: _Parts, chosen: BoolArray, rim: FloatArray) -> BoolArray:
+def _drop_scattered(parts: _Parts, chosen: BoolArray, rim: FloatArray) -> BoolArray:
     """Return the chosen parts (c,) without the small ones that mostly border on parts that are not chosen."""
+    hinges = parts.hinges
     one, other = parts.component[hinges.first], parts.component[hinges.second]
     apart = one != other
     one, other, length = one[apart], other[apart], hinges.length[apart]
@@ -203,27 +204,21 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
         rim: FloatArray = np.bincount(parts.component, outline.sum(axis=1), parts.count).astype(np.float64)
         if angle == CREASE:
             chosen &= ~parts.rough | (parts.area >= _TUNING.large_share)
-            chosen = _drop_scattered(hinges, parts, chosen, rim)
+            chosen = _drop_scattered(parts, chosen, rim)
         elif angle:
             chosen &= (parts.area >= _TUNING.min_share) & (rim**2 <= _TUNING.max_perimeter * parts.area * whole)
         if chosen.any():
-            _unroll(V, F, hinges, parts, chosen, cost, found, mirror)
+            _unroll(V, parts, chosen, cost, found, mirror)
         if (found.label >= 0).all():
             break
     return found
 
 
 def _unroll(
-    V: FloatArray,
-    F: IntArray,
-    hinges: Hinges,
-    parts: _Parts,
-    chosen: BoolArray,
-    cost: FloatArray,
-    found: Pieces,
-    mirror: Mirror | None,
+    V: FloatArray, parts: _Parts, chosen: BoolArray, cost: FloatArray, found: Pieces, mirror: Mirror | None
 ) -> None:
     """Unroll the chosen parts (c,) and add those that do not overlap themselves to the pieces."""
+    F, hinges = parts.F, parts.hinges
     inside = parts.joined & chosen[parts.component[hinges.first]]
     place = _lay(V, F, hinges, inside)
     joined = np.flatnonzero(inside)
@@ -238,7 +233,7 @@ def _unroll(
             # The mirror image of this part has been cut.
             cut[here] = cut[image[here]]
         else:
-            cut[here[parts.find_cut(hinges, k, here, dear[here])]] = True
+            cut[here[parts.find_cut(k, here, dear[here])]] = True
     if cut.any():
         place = _lay(V, F, hinges, inside & ~cut)
         # Cuts to holes that need none close again.
@@ -248,8 +243,7 @@ def _unroll(
     names, own = np.unique(split[rows], return_inverse=True)
     own = own.reshape(-1, 3)
     count = np.bincount(own.ravel())
-    z = np.bincount(own.ravel(), place[rows].real.ravel()) + 1j * np.bincount(own.ravel(), place[rows].imag.ravel())
-    z /= count
+    z = sum_at(own.ravel(), place[rows].ravel(), len(names)) / count
     origin = np.empty(len(names), dtype=np.int64)
     origin[own] = F[rows]
     kinds, which = np.unique(component[rows], return_inverse=True)
@@ -287,7 +281,7 @@ def _separate_touching(z: ComplexArray, F: IntArray, part: IntArray) -> ComplexA
     shortest = np.abs(corners - np.roll(corners, 1, axis=1)).min(axis=1)
     least = np.full(len(z), np.inf)
     np.minimum.at(least, F, shortest[:, None])
-    step = np.bincount(F.ravel(), inward.real.ravel()) + 1j * np.bincount(F.ravel(), inward.imag.ravel())
+    step = sum_at(F.ravel(), inward.ravel(), len(z))
     length = np.maximum(np.abs(step), np.finfo(float).tiny)
     return np.where(touching, z + _TUNING.apart * least * step / length, z)
 
@@ -304,11 +298,8 @@ def _is_stretched(V: FloatArray, F: IntArray, uv: FloatArray) -> BoolArray:
 def _lay(V: FloatArray, F: IntArray, hinges: Hinges, inside: BoolArray) -> ComplexArray:
     """Return the positions (f, 3) of triangles that are laid out along some hinges, flat and long ones first."""
     number = np.flatnonzero(inside)
-    rank = np.empty(number.size)
-    rank[np.lexsort((-hinges.length[number], ~hinges.flat[number]))] = np.arange(1, number.size + 1)
-    linked = np.zeros(inside.size, dtype=bool)
-    linked[number] = spanning_links(hinges.first[number], hinges.second[number], rank, len(F))
-    component = fans(F, ~hinges.mark_sides(linked, len(F)))[1]
+    order = np.lexsort((-hinges.length[number], ~hinges.flat[number]))
+    linked, _, component = find_forest(F, hinges, number[order])
     return lay_along(V, F, hinges.one[linked], hinges.other[linked], component)
 
 

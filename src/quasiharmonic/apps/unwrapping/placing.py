@@ -18,7 +18,6 @@ from quasiharmonic.apps.atlas.packing.pack import Packing, Placement, check_text
 from quasiharmonic.apps.unwrapping.chart import Chart
 from quasiharmonic.util.arrays import (
     BoolArray,
-    ComplexArray,
     FloatArray,
     IntArray,
     count_of,
@@ -150,10 +149,9 @@ def _pack_tiles(
 
 @dataclass(frozen=True, eq=False)
 class _TexelBoxes:
-    """Boxes of charts at unit scale: sides (c, 2), their directions (c,), and which charts are rectangles (c,)."""
+    """Boxes of charts at unit scale: sides (c, 2), and which charts are rectangles (c,)."""
 
     sides: FloatArray
-    directions: ComplexArray
     rectangular: BoolArray
 
     def stretch(self, scale: float) -> FloatArray:
@@ -182,7 +180,7 @@ def _pack_texel_boxes(
     directions = np.array([shape.direction if rotate else 1.0 for shape in shapes], dtype=np.complex128)
     sides = np.array([shape.extent(complex(along)) for shape, along in zip(shapes, directions, strict=True)])
     area = np.array([shape.area for shape in shapes])
-    boxes = _TexelBoxes(sides, directions, area >= (1 - rectangle) * sides.prod(axis=1))
+    boxes = _TexelBoxes(sides, area >= (1 - rectangle) * sides.prod(axis=1))
     gap = ceil(padding)
     scale = density or sqrt(size[0] * size[1] / max(float(sides.prod(axis=1).sum()), np.finfo(float).tiny))
     placed = _place(boxes.texels(scale), size, gap, rotate)

@@ -16,7 +16,7 @@ from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
 from quasiharmonic.io.objects import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, find_exponent, names_of
-from quasiharmonic.util.outcome import Displayable, Outcome
+from quasiharmonic.util.outcome import Displayable, Outcome, as_plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -347,15 +347,13 @@ class UnwrapResult(Outcome, Displayable):
             "seam_length": self.seam_length,
             "stretch": _finite(self.stretch),
             "misses": [miss._asdict() | {"stretch": _finite(miss.stretch)} for miss in self.misses],
-            "utilisation": self.utilisation,
-            "texels_per_unit": self.texels_per_unit,
+            **as_plain(self, "utilisation", "texels_per_unit"),
             "resolution": list(self.resolution),
             "strips": [strip._asdict() for strip in self.strips],
             "symmetry": self.symmetry._asdict(),
             "unfinished": self.unfinished.tolist(),
             "reversed": int(self.cleaned.flipped.sum()),
-            "excluded": self.cleaned.excluded.tolist(),
-            "collapsed": self.cleaned.collapsed.tolist(),
+            **as_plain(self.cleaned, "excluded", "collapsed"),
             "close_vertices": self.cleaned.close.tolist(),
             "mesh": self.cleaned.report.to_dict(),
         }

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.inverse_map import ChartInverse
-from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate
 from quasiharmonic.apps.unwrapping.model_files import label_statements
-from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStatus
+from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.io.accepts_mesh import AcceptsMesh
 from quasiharmonic.io.mesh_files import read_mesh
 from quasiharmonic.io.models.meshdata import MeshData
@@ -32,7 +31,7 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 from quasiharmonic.util.options import INSTANCES
-from quasiharmonic.util.outcome import Outcome
+from quasiharmonic.util.outcome import OutcomeOf
 
 if TYPE_CHECKING:
     from trimesh import Scene, Trimesh
@@ -99,7 +98,7 @@ class ScenePart:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SceneResult(Outcome):
+class SceneResult(OutcomeOf):
     """Texture coordinates of several meshes in one texture, made by `unwrap`.
 
     Attributes
@@ -117,24 +116,9 @@ class SceneResult(Outcome):
     source: Any
 
     @property
-    def success(self) -> bool:
-        """Whether every chart is bijective and no two charts overlap."""
-        return self.atlas.success
-
-    @property
-    def status(self) -> UnwrapStatus:
-        """The status of the atlas."""
-        return self.atlas.status
-
-    @property
-    def certificate(self) -> UnwrapCertificate:
-        """The exact verdict on the charts of all meshes."""
-        return self.atlas.certificate
-
-    @property
-    def seconds(self) -> float:
-        """Wall time of the call."""
-        return self.atlas.seconds
+    def result(self) -> UnwrapResult:
+        """Equal to ``atlas``."""
+        return self.atlas
 
     def summary(self) -> str:
         """Return the number of meshes, and the summary of the atlas."""

@@ -119,7 +119,7 @@ def find_rules(
     mirror, symmetry = None, Symmetry(None, 0.0, False, "")
     uv = uv_cuts = None
     if corner_uv is not None:
-        uv = _turn_corners(corner_uv, cleaned)
+        uv = cleaned.take_corners(corner_uv)
         uv_cuts = _find_uv_cuts(uv, cleaned)
     else:
         plain = costs is None and labels is None and wanted.empty
@@ -178,14 +178,6 @@ def _turn_sides(costs: FloatArray, cleaned: CleanedMesh) -> FloatArray:
     # Reversing a triangle exchanges its first and last side.
     turned[cleaned.flipped] = turned[cleaned.flipped][:, ::-1]
     return turned
-
-
-def _turn_corners(corner_uv: FloatArray, cleaned: CleanedMesh) -> FloatArray:
-    """Return the texture coordinates of the corners of the cleaned triangles."""
-    position = corner_uv[cleaned.triangles]
-    # Reversing a triangle exchanges its last two corners.
-    position[cleaned.flipped] = position[cleaned.flipped][:, (0, 2, 1)]
-    return position
 
 
 def _find_uv_cuts(corner_uv: FloatArray, cleaned: CleanedMesh) -> IntArray:
@@ -336,5 +328,4 @@ def _reach(tip: int, ends: IntArray, weight: FloatArray, chosen: BoolArray, bord
 def _list_single_edges(ends: IntArray, chosen: BoolArray, rim: BoolArray) -> list[int]:
     """Return the chosen edges that touch neither another one nor the boundary."""
     times = np.bincount(ends[chosen].ravel(), minlength=len(rim)) + rim
-    alone: list[int] = np.flatnonzero(chosen & (times[ends] == 1).all(axis=1)).tolist()
-    return alone
+    return list(np.flatnonzero(chosen & (times[ends] == 1).all(axis=1)).tolist())

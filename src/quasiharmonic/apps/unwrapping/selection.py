@@ -23,6 +23,7 @@ from quasiharmonic.util.arrays import (
     index_array,
     mark,
     names_of,
+    pad_to_space,
     to_complex,
 )
 
@@ -113,8 +114,7 @@ class KeptCharts:
     def find_density(self, V: FloatArray, F: IntArray, size: tuple[int, int]) -> float | None:
         """Return the mean of the texels per unit of length of the model, weighted by area; None if it is zero."""
         exponent = find_exponent(V)
-        points = np.pad(np.ldexp(V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
-        area = np.linalg.norm(area_vectors(points, F[~self.replaced]), axis=1) / 2
+        area = np.linalg.norm(area_vectors(pad_to_space(np.ldexp(V, -exponent)), F[~self.replaced]), axis=1) / 2
         sides = self.corner_uv[~self.replaced] * size
         texels = np.abs(np.linalg.det(sides[:, 1:] - sides[:, :1])) / 2
         total = float(area.sum())
@@ -124,17 +124,13 @@ class KeptCharts:
     def join(self, new: ChartLayout, cleaned: CleanedMesh) -> ChartLayout:
         """Return the layout of all charts of a cleaned mesh, new ones first."""
         stay, replaced = self.rows, np.flatnonzero(self.replaced[cleaned.triangles])
-        kept, count = self.layout, len(cleaned.F)
-        joined = ChartLayout(
-            np.empty((count, 3), dtype=np.int64),
+        order, kept = np.argsort(np.concatenate([replaced, stay])), self.layout
+        return ChartLayout(
+            np.concatenate([new.rows, kept.rows + len(new.uv)])[order],
             np.concatenate([new.uv, kept.uv]),
-            np.empty(count, dtype=np.int64),
-            np.empty(count, dtype=np.bool_),
+            np.concatenate([new.chart, kept.chart + int(new.chart.max()) + 1])[order],
+            np.concatenate([new.mirrored, kept.mirrored])[order],
         )
-        joined.rows[replaced], joined.rows[stay] = new.rows, kept.rows + len(new.uv)
-        joined.chart[replaced], joined.chart[stay] = new.chart, kept.chart + int(new.chart.max()) + 1
-        joined.mirrored[replaced], joined.mirrored[stay] = new.mirrored, kept.mirrored
-        return joined
 
     def certify(
         self, joined: ChartLayout, cleaned: CleanedMesh, *, size: tuple[int, int], padding: float, stacked: bool
@@ -176,11 +172,9 @@ def keep_charts(cleaned: CleanedMesh, replaced: BoolArray, corner_uv: FloatArray
             f"uv has no texture coordinates for {names_of('triangle', 'triangles', missing)}, which faces does not "
             "select: add them to faces"
         )
-    there = np.isfinite(corner_uv[cleaned.triangles]).all(axis=(1, 2))
-    F = cleaned.F[there]
-    at = corner_uv[cleaned.triangles[there]]
-    turned = cleaned.flipped[there]
-    at[turned] = at[turned][:, (0, 2, 1)]
+    at = cleaned.take_corners(corner_uv)
+    there = np.isfinite(at).all(axis=(1, 2))
+    F, at = cleaned.F[there], at[there]
     number = np.unique(at.reshape(-1, 2), axis=0, return_inverse=True)[1].reshape(-1, 3)
     cut = mark(F.size, find_differing_sides(F, number, len(cleaned.V))).reshape(-1, 3)
     split, chart = fans(F, cut)

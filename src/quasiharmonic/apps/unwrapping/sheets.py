@@ -158,8 +158,7 @@ def _restore_larger_part(links: Links, turned: BoolArray, area: FloatArray) -> B
     component = label_components(links.one // 3, links.other // 3, area.size)
     most = np.bincount(component, np.where(turned, area, -area), area.size)
     whole = np.bincount(component, area, area.size)
-    restored: BoolArray = turned ^ (most > _TUNING.rounding * whole)[component]
-    return restored
+    return np.asarray(turned ^ (most > _TUNING.rounding * whole)[component])
 
 
 def _two_colour(one: IntArray, other: IntArray, weight: FloatArray) -> BoolArray:
@@ -254,8 +253,7 @@ def _score_pairs(
 def _normalise(vectors: FloatArray) -> FloatArray:
     """Scale vectors (k, 3) to unit length; zero stays zero."""
     vectors = vectors / np.maximum(np.abs(vectors).max(axis=1, keepdims=True), np.finfo(float).tiny)
-    unit: FloatArray = vectors / np.maximum(np.sqrt((vectors**2).sum(axis=1, keepdims=True)), 0.5)
-    return unit
+    return np.asarray(vectors / np.maximum(np.sqrt((vectors**2).sum(axis=1, keepdims=True)), 0.5))
 
 
 def _split(F: IntArray, links: Links, turned: BoolArray, contested: IntArray) -> tuple[IntArray, Links, IntArray]:

@@ -7,18 +7,19 @@ is cut along one. The sides of columns and rows then get mean lengths.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges, find_hinges
 from quasiharmonic.apps.unwrapping.pieces import CREASE
-from quasiharmonic.apps.unwrapping.unrolling import lay_along, spanning_links
+from quasiharmonic.apps.unwrapping.unrolling import find_forest, lay_along
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
 from quasiharmonic.geometry.mesh.splitting import fans
-from quasiharmonic.geometry.mesh.topology import edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, group_by_label, pair_keys
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark
 
 # Strips end at edges with larger angles between the normals. The first one allows all edges.
@@ -162,24 +163,19 @@ def _list_parts(F: IntArray, hinges: Hinges, joined: BoolArray) -> list[tuple[In
     part = fans(F, ~hinges.mark_sides(joined, len(F)))[1]
     number = np.flatnonzero(joined)
     of_hinge = part[hinges.first[number]]
-    rows, number = np.argsort(part, kind="stable"), number[np.argsort(of_hinge, kind="stable")]
-    starts = np.arange(1, int(part.max(initial=-1)) + 1)
-    triangles = np.split(rows, np.searchsorted(part[rows], starts))
-    inside = np.split(number, np.searchsorted(np.sort(of_hinge), starts))
-    return [pair for pair in zip(triangles, inside, strict=True) if pair[1].size]
+    # Both lists have the parts with hinges, by ascending labels.
+    triangles = group_by_label(np.where(mark(len(F), of_hinge)[part], part, -1))
+    return list(zip(triangles, (number[some] for some in group_by_label(of_hinge)), strict=True))
 
 
 def _lay_squares(F: IntArray, hinges: Hinges, joined: BoolArray, diagonal: BoolArray) -> ComplexArray:
     """Lay out triangles (f, 3) along joined hinges (e,) as if their quadrilaterals were unit squares."""
     side = np.zeros(len(F), dtype=np.int64)
     side[hinges.first[diagonal]], side[hinges.second[diagonal]] = hinges.one[diagonal] % 3, hinges.other[diagonal] % 3
-    number = np.flatnonzero(joined)
-    rank = np.arange(1.0, number.size + 1)
-    number = number[spanning_links(hinges.first[number], hinges.second[number], rank, len(F))]
-    component = fans(F, ~hinges.mark_sides(mark(joined.size, number), len(F)))[1]
+    linked, _, component = find_forest(F, hinges, np.flatnonzero(joined))
     # Half a square in each triangle, with its diagonal at this side.
     half = np.array([[0.0, 0.0, 0.0], [1, 1, 0], [0, 1, 0]])[(np.arange(3) - side[:, None]) % 3].reshape(-1, 3)
-    place = lay_along(half, np.arange(F.size).reshape(-1, 3), hinges.one[number], hinges.other[number], component)
+    place = lay_along(half, np.arange(F.size).reshape(-1, 3), hinges.one[linked], hinges.other[linked], component)
     # The sides of the first square lie along the axes.
     first = np.unique(component, return_index=True)[1]
     leg = place[first, (side[first] + 2) % 3] - place[first, (side[first] + 1) % 3]
@@ -251,6 +247,4 @@ def _make_rectangle(V: FloatArray, F: IntArray, cost: FloatArray, rows: IntArray
     vertices = T.ravel()[first]
     working = WorkingChart(rows, vertices, V[vertices], own, cost[rows])
     working.use(uv)
-    assert working.uv is not None
-    uv = np.ldexp(working.uv, working.piece.exponent)
-    return Chart(rows, own, vertices, uv, working.stretch, 0.0, straight=True)
+    return replace(finish_chart(working, 0.0), straight=True)

@@ -70,8 +70,7 @@ class Mirror:
         ends, n = hinges.ends(F), len(self.vertex)
         key, image = pair_keys(ends, n), pair_keys(self.vertex[ends], n)
         order = np.argsort(key)
-        found: IntArray = order[np.searchsorted(key[order], image)]
-        return found
+        return np.asarray(order[np.searchsorted(key[order], image)])
 
 
 def find_mirror(V: FloatArray, F: IntArray, axis: str) -> tuple[Mirror | None, Symmetry]:

@@ -10,14 +10,14 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart, cut_out_chart
 from quasiharmonic.apps.unwrapping.hinges import Hinges, ahead, find_hinges
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.loops import simple_loops
 from quasiharmonic.geometry.mesh.reference import area_vectors, rest_frames
-from quasiharmonic.geometry.mesh.splitting import fans, renumber
+from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys, group_by_label
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, to_points
 
 #: Two sides of an edge are at one place if their ends are at most this fraction of its length apart.
 SAME = 1e-3
@@ -27,10 +27,15 @@ _FLAT = 1e-9
 _SMALL, _SMALL_SHARE = 24, 0.01
 
 
-def spanning_links(first: IntArray, second: IntArray, rank: FloatArray, size: int) -> BoolArray:
-    """Return which links (e,) between nodes below ``size`` form the spanning forest of smallest ranks, all distinct."""
-    links = csr_array((rank, (first.astype(np.int32), second.astype(np.int32))), shape=(size, size))
-    return np.isin(rank, minimum_spanning_tree(links).data)
+def find_forest(F: IntArray, hinges: Hinges, preferred: IntArray) -> tuple[BoolArray, IntArray, IntArray]:
+    """Return a mask (e,) of hinges that join triangles (f, 3) to a spanning forest, and `fans` joined at these only.
+
+    ``preferred`` (k,) are the hinges that may be used, best first.
+    """
+    rank, ends = np.arange(1.0, preferred.size + 1), (hinges.first[preferred], hinges.second[preferred])
+    links = csr_array((rank, tuple(end.astype(np.int32) for end in ends)), shape=(len(F), len(F)))
+    linked = mark(hinges.one.size, preferred[np.isin(rank, minimum_spanning_tree(links).data)])
+    return linked, *fans(F, ~hinges.mark_sides(linked, len(F)))
 
 
 def lay_along(V: FloatArray, F: IntArray, one: IntArray, other: IntArray, component: IntArray) -> ComplexArray:
@@ -80,8 +85,7 @@ def meet(place: ComplexArray, hinges: Hinges, chosen: IntArray) -> BoolArray:
     """Return which of some hinges (k,) have both sides at one place, up to `SAME`, given the corners' places (f, 3)."""
     z, one, other = place.ravel(), hinges.one[chosen], hinges.other[chosen]
     apart = np.maximum(np.abs(z[one] - z[ahead(other)]), np.abs(z[ahead(one)] - z[other]))
-    same: BoolArray = apart <= SAME * hinges.length[chosen]
-    return same
+    return np.asarray(apart <= SAME * hinges.length[chosen])
 
 
 def lay_flat_parts(V: FloatArray, F: IntArray, component: IntArray) -> tuple[BoolArray, FloatArray]:
@@ -111,8 +115,7 @@ def lay_flat_parts(V: FloatArray, F: IntArray, component: IntArray) -> tuple[Boo
         corners /= np.where(size > 0, size, 1.0)[component][:, None, None]
     along, across = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cross = np.cross(along, across)
-    sums = [np.bincount(component, cross[:, k], minlength=count) for k in range(3)]
-    normal: FloatArray = np.stack(sums, axis=1).astype(np.float64)
+    normal = np.stack([np.bincount(component, axis, count) for axis in cross.T], axis=1).astype(np.float64)
     length = np.linalg.norm(normal, axis=1)
     normal = normal / np.where(length > 0, length, 1.0)[:, None]
     height = np.abs((corners * normal[component][:, None]).sum(axis=2)).max(axis=1)
@@ -186,9 +189,7 @@ def unfold_small_components(
     split, component, uv, good = _unfold(V, F[rows], undivided[rows])
     for k, some in enumerate(group_by_label(component)):
         if good[k]:
-            own, corner = renumber(split[some], F[rows[some]])
-            vertices = F[rows[some]].ravel()[corner]
-            charts.append(Chart(rows[some], own, vertices, uv[split[some].ravel()[corner]], np.ones(some.size), 0.0))
+            charts.append(cut_out_chart(rows[some], split[some], F[rows[some]], uv[split[some]], np.ones(some.size)))
     mask[rows[good[component]]] = True
     return mask, charts
 
@@ -218,12 +219,7 @@ def _unfold(V: FloatArray, F: IntArray, undivided: BoolArray) -> tuple[IntArray,
     hinges = find_hinges(V, F)
     bend = 1 - np.cos(hinges.angle)
     bend[undivided.ravel()[hinges.one] | undivided.ravel()[hinges.other]] = -1.0
-    rank = np.empty(bend.size)
-    rank[np.argsort(bend, kind="stable")] = np.arange(1, bend.size + 1)
-    joined = spanning_links(hinges.first, hinges.second, rank, len(F))
-    split, component = fans(F, ~hinges.mark_sides(joined, len(F)))
+    joined, split, component = find_forest(F, hinges, np.argsort(bend, kind="stable"))
     place = lay_along(V, F, hinges.one[joined], hinges.other[joined], component)
-    uv = np.zeros((int(split.max()) + 1, 2))
-    flat = place.ravel()[np.unique(split.ravel(), return_index=True)[1]]
-    uv[:, 0], uv[:, 1] = flat.real, flat.imag
+    uv = to_points(place.ravel()[np.unique(split.ravel(), return_index=True)[1]])
     return split, component, uv, covers_once(split, uv, component, np.ones(int(component.max()) + 1, dtype=bool))

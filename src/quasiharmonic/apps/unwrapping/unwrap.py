@@ -11,7 +11,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY
+from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY, Textures
 from quasiharmonic.apps.unwrapping.chart import Chart, number_kinds
 from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, divide_long_charts, mend_charts
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_charts
@@ -362,21 +362,14 @@ def _make_charts(
     report: Callable[[str, int, int], object],
 ) -> list[Chart]:
     """Return the charts of a cleaned mesh that keep the bound, and fit into the texture."""
-    bound, tiles, most = float(wanted.max_stretch), wanted.tiles, wanted.max_charts
+    bound, most = float(wanted.max_stretch), wanted.max_charts
     straight, strips = list[Chart](), list[Strip]()
     if wanted.straighten:
         straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others, draft.strips = np.flatnonzero(rest), straight, strips
-    divide = partial(
-        divide_long_charts,
-        bound=bound,
-        size=size,
-        tiles=tiles,
-        max_charts=most,
-        for_packing=wanted.divide_for_packing,
-        density=density,
-    )
+    divide = partial(divide_long_charts, wanted=wanted, size=size, density=density)
+    textures = Textures(size, float(wanted.padding), wanted.tiles, wanted.rotate)
     charts = find_charts(
         points,
         cleaned.F[rest],
@@ -387,8 +380,7 @@ def _make_charts(
         uv=None if rules.uv is None else rules.uv[rest],
         mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
         draft=draft,
-        choose=LayoutChoice(divide, size, float(wanted.padding), tiles, wanted.rotate, float(wanted.packing_loss)),
-        seed=wanted.seed,
+        choose=LayoutChoice(divide, textures, float(wanted.packing_loss)),
         callback=report,
         jobs=wanted.jobs,
     )

@@ -64,6 +64,20 @@ class BitmapTuning(NamedTuple):
 _TUNING = BitmapTuning()
 
 
+class Textures(NamedTuple):
+    """The tiles into which shapes are packed."""
+
+    size: tuple[int, int]  # Width and height of each tile in texels
+    padding: float  # Distance between shapes, and twice the distance to the sides of the tile, in texels
+    tiles: int
+    rotate: bool  # Whether shapes may be rotated
+
+    @property
+    def texels(self) -> int:
+        """Number of texels of all tiles."""
+        return self.tiles * self.size[0] * self.size[1]
+
+
 @dataclass(frozen=True, eq=False)
 class Layout:
     """Where shapes are placed.
@@ -91,19 +105,16 @@ class BitmapSearch:
     def __init__(
         self,
         shapes: Sequence[Shape],
-        size: tuple[int, int],
-        padding: float,
-        tiles: int,
+        into: Textures,
         scale: float,
         *,
-        rotate: bool,
         bitmaps: int = BITMAPS,
         given: ComplexArray | None = None,
         skewed: bool = True,
         occupied: Occupied | None = None,
         finer: int = 1,
     ) -> None:
-        self._size, self._tiles, self._padding = size, tiles, padding
+        size, padding, tiles, rotate = self._into = into
         few = len(shapes) <= MANY
         cells = finer * ((_TUNING.cells if given is None else _TUNING.fine_cells) if few else _TUNING.cells_of_many)
         number = _TUNING.charts_per_tile if few else _TUNING.many_per_tile
@@ -134,7 +145,7 @@ class BitmapSearch:
                 self._bitmaps[i] = self._draw(shapes[i], turns, radius)
         self._least_cells = sum(bitmaps.count for bitmaps in self._bitmaps.values())
         # Small shapes lie in their smallest boxes.
-        self._lying = np.array([_find_lying(shapes[i]) if rotate else 1 + 0j for i in small.tolist()])
+        self._lying = np.array([shapes[i].lying if rotate else 1 + 0j for i in small.tolist()])
         sides = [shapes[i].extent(direction)[::-1] for i, direction in zip(small, self._lying, strict=True)]
         self._boxes = np.array(sides).reshape(-1, 2) / self._cell
 
@@ -195,7 +206,7 @@ class BitmapSearch:
         On a larger board, they may not fit: the first ones then lie elsewhere. So all sizes are tried, smallest first.
         """
         cells = int(_TUNING.fewest_cells * self.cells)
-        last = int(min(MORE_CELLS * self.cells, max(self._size) / (self._cell * least)))
+        last = int(min(MORE_CELLS * self.cells, max(self._into.size) / (self._cell * least)))
         while (best := self.place_in(cells)) is None and cells < last:
             cells = min(cells + max(1, int(precision * cells)), last)
         return best, cells
@@ -205,9 +216,10 @@ class BitmapSearch:
 
         ``parts`` (n,) restricts the directions of each shape to one half, 1 or 2, or not, 0.
         """
-        texels = max(self._size) / cells
-        columns, rows = count_cells(self._size, texels)
-        if self._least_cells > self._tiles * columns * rows:
+        size, padding, most, _ = self._into
+        texels = max(size) / cells
+        columns, rows = count_cells(size, texels)
+        if self._least_cells > most * columns * rows:
             return None
         boards: list[Board] = []
 
@@ -218,14 +230,14 @@ class BitmapSearch:
             boards.append(board)
             return board
 
-        while self._occupied is not None and len(boards) < self._tiles:
+        while self._occupied is not None and len(boards) < most:
             open_board()
 
         def find(bitmaps: Bitmaps) -> tuple[int, Spot] | None:
             for tile, board in enumerate(boards):
                 if spot := board.find(bitmaps):
                     return tile, spot
-            spot = open_board().find(bitmaps) if len(boards) < self._tiles else None
+            spot = open_board().find(bitmaps) if len(boards) < most else None
             return None if spot is None else (len(boards) - 1, spot)
 
         n = len(self.areas)
@@ -251,9 +263,9 @@ class BitmapSearch:
             centres[i] = complex(spot.column + bitmap.shape[1] / 2, spot.row + bitmap.shape[0] / 2) * texels
         rest = self._order[self._drawn :]
         directions[rest] = self._lying
-        boxes = np.ceil(self._boxes + self._padding / texels).astype(np.int64)
+        boxes = np.ceil(self._boxes + padding / texels).astype(np.int64)
         waiting = np.arange(len(rest))
-        for tile in range(self._tiles):
+        for tile in range(most):
             if not waiting.size:
                 break
             board = boards[tile] if tile < len(boards) else open_board()
@@ -265,10 +277,3 @@ class BitmapSearch:
                 break
             waiting = waiting[corners[:, 0] < 0]
         return None if waiting.size else Layout(texels / self._cell, directions, centres, tiles)
-
-
-def _find_lying(shape: Shape) -> complex:
-    """Direction of the longer side of the smallest box."""
-    direction = shape.direction
-    width, height = shape.extent(direction)
-    return direction if width >= height else direction * 1j

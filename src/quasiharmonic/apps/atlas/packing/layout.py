@@ -16,6 +16,7 @@ from quasiharmonic.apps.atlas.packing.bitmap_search import (
     TRIALS,
     BitmapSearch,
     Layout,
+    Textures,
 )
 from quasiharmonic.apps.atlas.packing.board import Occupied
 from quasiharmonic.apps.atlas.packing.shapes import Shape
@@ -51,14 +52,7 @@ MAX_SIZE = 1 << 24
 
 
 def find_layout(
-    shapes: Sequence[Shape],
-    size: tuple[int, int],
-    padding: float,
-    tiles: int,
-    *,
-    rotate: bool,
-    scale: float | None,
-    bitmaps: int = BITMAPS,
+    shapes: Sequence[Shape], into: Textures, scale: float | None, *, bitmaps: int = BITMAPS
 ) -> Layout | None:
     """Place shapes at the largest common scale that is found, or at a given scale.
 
@@ -66,13 +60,7 @@ def find_layout(
     ----------
     shapes : sequence of Shape
         At least one.
-    size : two int
-        Width and height of each tile in texels.
-    padding : float
-        Distance between shapes, and twice the distance to the sides of the tile, in texels.
-    tiles : int
-    rotate : bool
-        Allow rotations.
+    into : Textures
     scale : float or None
         Texels per unit of length.
     bitmaps : int
@@ -83,35 +71,29 @@ def find_layout(
     Layout
         None if the shapes do not fit, not even with a largest box of one texel.
     """
-    if len(shapes) == 1 and rotate and scale is None:
-        return _place_one(shapes[0], size, padding)
+    if len(shapes) == 1 and into.rotate and scale is None:
+        return _place_one(shapes[0], into)
     if scale is not None:
-        if not _may_fit(shapes, size, tiles, scale):
+        if not _may_fit(shapes, into, scale):
             return None
-        search = BitmapSearch(shapes, size, padding, tiles, scale, rotate=rotate, bitmaps=bitmaps)
+        search = BitmapSearch(shapes, into, scale, bitmaps=bitmaps)
         return search.place_in(search.cells)
-    layout, order = _enlarge(shapes, size, padding, tiles, least_scale(shapes), TRIALS, rotate=rotate, bitmaps=bitmaps)
+    layout, order = _enlarge(shapes, into, least_scale(shapes), TRIALS, bitmaps=bitmaps)
     if layout is None:
-        return _place_boxes(shapes, size, padding, tiles, rotate=rotate)
+        return _place_boxes(shapes, into)
     if order is None:
         return layout
-    fine = BitmapSearch(shapes, size, padding, tiles, layout.scale, rotate=rotate, given=layout.directions)
+    fine = BitmapSearch(shapes, into, layout.scale, given=layout.directions)
     return fine.enlarge_finely(order) or layout
 
 
 def _enlarge(
-    shapes: Sequence[Shape],
-    size: tuple[int, int],
-    padding: float,
-    tiles: int,
-    least: float,
-    trials: int,
-    **drawing: bool | int,
+    shapes: Sequence[Shape], into: Textures, least: float, trials: int, **drawing: int
 ) -> tuple[Layout, IntArray | None] | tuple[None, None]:
     """Place shapes at a large scale, larger than the least; return the layout, and the order of few shapes."""
-    expected = _expected_scale(shapes, size, padding, tiles)
+    expected = _expected_scale(shapes, into)
     while expected > least:
-        search = BitmapSearch(shapes, size, padding, tiles, expected, **drawing)  # type: ignore[arg-type]
+        search = BitmapSearch(shapes, into, expected, **drawing)  # type: ignore[arg-type]
         if len(shapes) > MANY:
             if (layout := search.enlarge_coarsely(least)) is not None:
                 return layout, None
@@ -122,14 +104,7 @@ def _enlarge(
 
 
 def find_layout_around(
-    occupied: Occupied,
-    shapes: Sequence[Shape],
-    size: tuple[int, int],
-    padding: float,
-    tiles: int,
-    *,
-    rotate: bool,
-    scale: float | None,
+    occupied: Occupied, shapes: Sequence[Shape], into: Textures, scale: float | None
 ) -> Layout | None:
     """Place shapes into the free part of tiles, at a given scale or at the largest one that is found.
 
@@ -137,7 +112,7 @@ def find_layout_around(
     ----------
     occupied : Occupied
         What is in the tiles.
-    shapes, size, padding, tiles, rotate, scale
+    shapes, into, scale
         See `find_layout`.
 
     Returns
@@ -145,16 +120,17 @@ def find_layout_around(
     Layout
         None if the shapes do not fit.
     """
+    size, padding, tiles, _ = into
     free = occupied.free_area(tiles, padding)
     sides = np.sqrt([shape.area for shape in shapes])
 
     def place(scale: float) -> Layout | None:
         # With half the padding around it, a shape covers at least this area, by the Brunn–Minkowski inequality.
         least = float(((scale * sides + sqrt(pi) * padding / 2) ** 2).sum())
-        if least > free or not _may_fit(shapes, size, tiles, scale):
+        if least > free or not _may_fit(shapes, into, scale):
             return None
         for finer in _TUNING.finer:
-            search = BitmapSearch(shapes, size, padding, tiles, scale, rotate=rotate, occupied=occupied, finer=finer)
+            search = BitmapSearch(shapes, into, scale, occupied=occupied, finer=finer)
             if (found := search.place_in(search.cells)) is not None:
                 return found
         return None
@@ -163,7 +139,7 @@ def find_layout_around(
         return place(scale)
     high = max(size) * max(1.0, sqrt(tiles)) / min(sum(shape.area for shape in shapes) ** 0.5, 1 / least_scale(shapes))
     best, low = None, high
-    longest = max(max(shape.extent(shape.direction)) for shape in shapes)
+    longest = max(max(shape.sides) for shape in shapes)
     for _ in range(_TUNING.halvings):
         high, low = low, low / 2
         best = place(low)
@@ -177,26 +153,24 @@ def find_layout_around(
     return best
 
 
-def estimate_use(
-    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool, above: float = 0.0
-) -> float:
+def estimate_use(shapes: Sequence[Shape], into: Textures, *, above: float = 0.0) -> float:
     """Part of the tiles that shapes cover if they are placed quickly; 0 if that is not above a given part."""
-    area, room = sum(shape.area for shape in shapes), tiles * size[0] * size[1]
+    area, room = sum(shape.area for shape in shapes), into.texels
     least = max(least_scale(shapes), sqrt(above * room / area)) if area > 0 else np.inf
-    layout, _ = _enlarge(shapes, size, padding, tiles, least, 0, rotate=rotate, skewed=False)
+    layout, _ = _enlarge(shapes, into, least, 0, skewed=False)
     return 0.0 if layout is None else area * layout.scale**2 / room
 
 
-def _may_fit(shapes: Sequence[Shape], size: tuple[int, int], tiles: int, scale: float) -> bool:
+def _may_fit(shapes: Sequence[Shape], into: Textures, scale: float) -> bool:
     """Whether neither the areas nor a length of shapes exclude that they fit into tiles at a scale."""
     area = sum(shape.area for shape in shapes) * scale * scale
-    longest = max(max(shape.extent(shape.direction)) for shape in shapes) * scale
-    return area <= tiles * size[0] * size[1] and longest <= hypot(*size)
+    longest = max(max(shape.sides) for shape in shapes) * scale
+    return area <= into.texels and longest <= hypot(*into.size)
 
 
-def _place_one(shape: Shape, size: tuple[int, int], padding: float) -> Layout | None:
+def _place_one(shape: Shape, into: Textures) -> Layout | None:
     """Place one shape in the middle of a tile, in the direction in which it can be largest."""
-    room = np.array([size[0] - padding, size[1] - padding])
+    room = np.array(into.size) - into.padding
 
     def scales(angles: FloatArray) -> FloatArray:
         seen = np.exp(-1j * angles)[:, None] * shape.hull
@@ -219,29 +193,29 @@ def _place_one(shape: Shape, size: tuple[int, int], padding: float) -> Layout | 
         return None
     if not max(shape.extent(1)):
         scale = least
-    return Layout(scale, np.exp(1j * np.array([best])), np.array([complex(*size) / 2]), np.zeros(1, dtype=np.int64))
+    return Layout(
+        scale, np.exp(1j * np.array([best])), np.array([complex(*into.size) / 2]), np.zeros(1, dtype=np.int64)
+    )
 
 
-def find_sufficient_size(
-    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool, scale: float | None
-) -> tuple[int, int]:
-    """Width and height of tiles, of the same ratio, into which shapes fit that do not fit into tiles of a size.
+def find_sufficient_size(shapes: Sequence[Shape], into: Textures, scale: float | None) -> tuple[int, int]:
+    """Width and height of tiles, of the same ratio, into which shapes fit that do not fit into the given ones.
 
     A side above `MAX_SIZE` means that none was found.
     """
 
     def enlarge(factor: float) -> tuple[int, int]:
-        return ceil(size[0] * factor), ceil(size[1] * factor)
+        return ceil(into.size[0] * factor), ceil(into.size[1] * factor)
 
     def fits(size: tuple[int, int]) -> bool:
-        if scale is None:
-            return _place_boxes(shapes, size, padding, tiles, rotate=rotate) is not None
-        return find_layout(shapes, size, padding, tiles, rotate=rotate, scale=scale) is not None
+        larger = into._replace(size=size)
+        found = _place_boxes(shapes, larger) if scale is None else find_layout(shapes, larger, scale)
+        return found is not None
 
     low, high = 1.0, 2.0
     while not fits(enlarge(high)):
         low, high = high, 2 * high
-        if high * max(size) > MAX_SIZE:
+        if high * max(into.size) > MAX_SIZE:
             return enlarge(high)
     while enlarge(low) != enlarge(high) and high - low > _TUNING.size_precision * high:
         middle = (low + high) / 2
@@ -249,21 +223,20 @@ def find_sufficient_size(
     return enlarge(high)
 
 
-def _place_boxes(
-    shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int, *, rotate: bool
-) -> Layout | None:
+def _place_boxes(shapes: Sequence[Shape], into: Textures) -> Layout | None:
     """Place shapes as boxes at the least scale."""
-    search = BitmapSearch(shapes, size, padding, tiles, least_scale(shapes), rotate=rotate, bitmaps=0)
-    return search.place_in(min(_TUNING.box_cells * max(size), MOST_CELLS))
+    search = BitmapSearch(shapes, into, least_scale(shapes), bitmaps=0)
+    return search.place_in(min(_TUNING.box_cells * max(into.size), MOST_CELLS))
 
 
 def least_scale(shapes: Sequence[Shape]) -> float:
     """Scale at which the longest side of all boxes is one texel."""
-    return 1 / (max(max(shape.extent(shape.direction)) for shape in shapes) or 1.0)
+    return 1 / (max(max(shape.sides) for shape in shapes) or 1.0)
 
 
-def _expected_scale(shapes: Sequence[Shape], size: tuple[int, int], padding: float, tiles: int) -> float:
+def _expected_scale(shapes: Sequence[Shape], into: Textures) -> float:
     """Scale at which the shapes with half the padding around them cover the expected share of the tiles."""
+    size, padding, tiles, _ = into
     area = sum(shape.area for shape in shapes)
     length = sum(float(np.abs(shape.heads - shape.tails).sum()) for shape in shapes)
     free = _TUNING.expected * tiles * size[0] * size[1] - len(shapes) * pi * padding**2 / 4

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, Layout
+from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, Layout, Textures
 from quasiharmonic.apps.atlas.packing.board import Occupied
 from quasiharmonic.apps.atlas.packing.layout import (
     MAX_SIZE,
@@ -193,6 +193,9 @@ def pack_charts(
     # Coordinates of later tiles are larger, and so are their rounding errors.
     reach = max(min(tiles, 10), -(-tiles // 10))
     spaced = padding + max(size) * (rounding * 2.0 ** (reach - 1).bit_length() + _deviation(pairs, copies))
+    into = Textures(size, spaced, tiles, rotate)
+    described = f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels"
+    no_fit = f"{described} {'does' if len(shapes) == 1 else 'do'} not fit into"
     if wanted is not None and wanted < least_scale(shapes):
         raise ValueError(
             f"with {texels_per_unit:g} texels per unit, all charts are smaller than a texel: use more texels per unit"
@@ -200,31 +203,27 @@ def pack_charts(
     if occupied is not None:
         at = map_array("occupied", occupied[0])
         around = Occupied(make_shape(at * size, triangle_array(occupied[1], len(at))), size)
-        layout = find_layout_around(around, shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+        layout = find_layout_around(around, shapes, into, wanted)
         if layout is None:
-            largest = find_layout_around(around, shapes, size, spaced, tiles, rotate=rotate, scale=None)
+            largest = find_layout_around(around, shapes, into, None)
             density = None if largest is None else float(np.ldexp(largest.scale, -exponent))
             raise ValueError(
-                f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels "
-                f"{'does' if len(shapes) == 1 else 'do'} not fit into the free part of {size[0]} × {size[1]} texels: "
+                f"{no_fit} the free part of {size[0]} × {size[1]} texels: "
                 + ("use more tiles or less padding" if density is None else f"texels_per_unit={density:.6g} suffices")
             )
     else:
-        layout = find_layout(shapes, size, spaced, tiles, rotate=rotate, scale=wanted, bitmaps=closely)
+        layout = find_layout(shapes, into, wanted, bitmaps=closely)
     if layout is None:
-        width, height = find_sufficient_size(shapes, size, spaced, tiles, rotate=rotate, scale=wanted)
+        width, height = find_sufficient_size(shapes, into, wanted)
         if max(width, height) > MAX_SIZE:
             wished = "" if texels_per_unit is None else f" and {texels_per_unit:g} texels per unit"
             raise ValueError(
-                f"the texture needs more than {MAX_SIZE:,} texels a side for "
-                f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels{wished}: "
+                f"the texture needs more than {MAX_SIZE:,} texels a side for {described}{wished}: "
                 f"use less padding{'' if texels_per_unit is None else ', or fewer texels per unit'}"
             )
         sufficient = f"{width} × {height} texels" if width != height else f"resolution={width}"
         raise ValueError(
-            f"{count_of('chart', 'charts', len(shapes))} with a padding of {padding:g} texels "
-            f"{'does' if len(shapes) == 1 else 'do'} not fit into "
-            f"{f'{tiles} tiles of ' if tiles > 1 else ''}{size[0]} × {size[1]} texels: {sufficient} suffices"
+            f"{no_fit} {f'{tiles} tiles of ' if tiles > 1 else ''}{size[0]} × {size[1]} texels: {sufficient} suffices"
         )
     placed = {i: _place(shape, layout, k) for k, (i, shape) in enumerate(zip(originals, shapes, strict=True))}
     for i, copy in copies.items():
@@ -236,7 +235,7 @@ def pack_charts(
     )
     covered = sum(shape.area for shape in shapes) * layout.scale**2
     density = float(np.ldexp(layout.scale, -exponent))
-    return Packing(placements, uv, density, covered / (tiles * size[0] * size[1]))
+    return Packing(placements, uv, density, covered / into.texels)
 
 
 def _check_charts(charts: Sequence[tuple[ArrayLike, ArrayLike]]) -> list[tuple[FloatArray, IntArray]]:

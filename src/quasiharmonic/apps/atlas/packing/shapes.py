@@ -57,6 +57,16 @@ class Shape:
         straight = np.minimum(np.abs(along.real), np.abs(along.imag)) <= np.sin(_SKEW) * length
         return float(length[straight].sum()), float(length.sum())
 
+    @cached_property
+    def sides(self) -> tuple[float, float]:
+        """Width and height of the shape's box with the shape's direction."""
+        return self.extent(self.direction)
+
+    @property
+    def lying(self) -> complex:
+        """Unit vector along the longer side of this box."""
+        return self.direction if self.sides[0] >= self.sides[1] else self.direction * 1j
+
     def extent(self, direction: complex) -> tuple[float, float]:
         """Width and height of the shape's box with a side along a unit vector."""
         seen = self.hull * direction.conjugate()
@@ -172,30 +182,21 @@ def find_smallest_box(hull: ComplexArray) -> complex:
     """Unit vector along a side of the box of smallest area around a convex hull (h,), at most 45° from the x-axis."""
     # Positions of hull points computed per block.
     block = 1 << 20
-    along = _side_directions(hull)
+    sides = np.roll(hull, -1) - hull
+    along = _turn_to_axis(np.concatenate([[1 + 0j], sides[sides != 0] / np.abs(sides[sides != 0])]))
     boxes = [
         np.ptp(seen.real, axis=1) * np.ptp(seen.imag, axis=1)
         for some in np.array_split(along, 1 + along.size * hull.size // block)
         for seen in (hull[None, :] * some.conj()[:, None],)
     ]
-    return _least_rotated(along, np.concatenate(boxes))
-
-
-def _side_directions(hull: ComplexArray) -> ComplexArray:
-    """Directions of the hull's sides as unit vectors, rotated by multiples of 90° to at most 45° from the x-axis."""
-    sides = np.roll(hull, -1) - hull
-    return _turn_to_axis(np.concatenate([[1 + 0j], sides[sides != 0] / np.abs(sides[sides != 0])]))
+    size = np.concatenate(boxes)
+    # Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
+    as_small = 1e-9
+    small = np.flatnonzero(size <= (1 + as_small) * size.min())
+    return complex(along[small[np.argmin(np.abs(along[small].imag))]])
 
 
 def _turn_to_axis(along: ComplexArray) -> ComplexArray:
     """Rotate unit vectors by multiples of 90° to at most 45° from the x-axis."""
     turn = np.array([1, -1j, -1, 1j])[np.rint(np.angle(along) / (np.pi / 2)).astype(np.int64) % 4]
     return np.asarray(along * turn)
-
-
-def _least_rotated(along: ComplexArray, size: FloatArray) -> complex:
-    """Of the directions with the smallest size the one with the smallest rotation."""
-    # Boxes whose areas differ by at most this fraction count as equal; the one with the smallest rotation is taken.
-    as_small = 1e-9
-    small = np.flatnonzero(size <= (1 + as_small) * size.min())
-    return complex(along[small[np.argmin(np.abs(along[small].imag))]])
