@@ -22,7 +22,7 @@ from common import INK, panels, run, save
 from quasiharmonic import AirMesh, Certificate, certify, harmonise, injective_map
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP, AreaBarrier, Combination, UnsignedARAP
-from quasiharmonic.energies.newton.map_model import newton_descent
+from quasiharmonic.energies.newton.newton_descent import newton_descent
 from quasiharmonic.geometry.exact.constrained_delaunay import constrained_delaunay
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 

@@ -90,9 +90,10 @@ def place_charts(
     wanted: UnwrapOptions,
     size: tuple[int, int],
     density: float | None,
+    exponent: int,
     **options: Any,
 ) -> Packing:
-    """Return the packing of charts.
+    """Return the packing of charts, which are in units of ``2 ** exponent``, as is the ``density``.
 
     ``tile`` has the tile of each triangle of the cleaned mesh; None without ``tile_by``. ``options`` are those of
     `pack_charts` that `UnwrapOptions` does not have. ValueError if the charts do not fit.
@@ -102,16 +103,18 @@ def place_charts(
         return _pack_texel_boxes(charts, size, padding, wanted.rotate, density)
 
     def pack(some: Sequence[Chart], density: float | None) -> Packing:
-        return pack_charts(
-            [(chart.uv, chart.F) for chart in some],
+        # In the model's own unit, so that messages have its density.
+        packing = pack_charts(
+            [(np.ldexp(chart.uv, exponent), chart.F) for chart in some],
             resolution=size,
             padding=padding if tile is None else padding + _TUNING.rounding * max(size),
-            texels_per_unit=density,
+            texels_per_unit=None if density is None else float(np.ldexp(density, -exponent)),
             tiles=wanted.tiles,
             rotate=wanted.rotate,
             stack=bool(wanted.stack),
             **options,
         )
+        return replace(packing, texels_per_unit=float(np.ldexp(packing.texels_per_unit, exponent)))
 
     if tile is None:
         return pack(charts, density)

@@ -293,6 +293,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
             wanted,
             size,
             density,
+            exponent,
             kinds=number_kinds(charts, wanted.stack, rules.mirror, points, cleaned.F),
             closely=_PACKED_CLOSELY if ended else BITMAPS,
             occupied=None if kept is None or not kept.count else (kept.layout.uv, kept.layout.rows),
