@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from quasiharmonic import io
+from quasiharmonic import atlas, inspect_mesh, io
+from quasiharmonic.geometry.mesh.topology import are_sides
 from quasiharmonic.surfaces import annulus, cat, grid, starfish
 from quasiharmonic.ui.studio import setup
 from quasiharmonic.ui.studio.setup import make_first_state
 from quasiharmonic.ui.studio.surface import MAX_TRIANGLES, make_sheet
+from quasiharmonic.ui.studio.validation import RequestError
 from shared.pages import Visitor
 
 
@@ -154,6 +157,67 @@ def test_a_model_that_is_inside_out_is_recognised_and_turned():
     assert (shown["inward"], shown["turned"], shown["bijective"]) == (0, True, True)
     one.does("undo")
     assert one.last("map").header["inward"] == 1
+
+
+def quads(n=24, m=12):
+    """Return vertices and quadrilaterals of a band of a sphere from pole to pole."""
+    theta, phi = np.linspace(0.3, np.pi - 0.3, m + 1), 2 * np.pi / n * np.arange(n)
+    z, r = np.repeat(np.cos(theta), n), np.repeat(np.sin(theta), n)
+    V = np.stack([r * np.cos(np.tile(phi, m + 1)), r * np.sin(np.tile(phi, m + 1)), z], axis=1)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(m), np.arange(n), indexing="ij"))
+    Q = np.stack([i * n + j, (i + 1) * n + j, (i + 1) * n + (j + 1) % n, i * n + (j + 1) % n], axis=1)
+    return V, Q
+
+
+def as_obj(V, faces, mapped=0, groups=""):
+    """Return an OBJ file in which the first faces have texture coordinates, in groups with these names."""
+    lines = ["v {} {} {}".format(*row) for row in V.tolist()] + [f"vt {k / 99} {k % 2}" for k in range(len(V))]
+    for k, face in enumerate(faces):
+        if groups and k % (len(faces) // len(groups)) == 0:
+            lines.append(f"g {groups[k * len(groups) // len(faces)]}")
+        lines.append("f " + " ".join(f"{v + 1}/{v + 1}" if k < mapped else str(v + 1) for v in face))
+    return "\n".join([*lines, ""]).encode()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", ["as it is", "unwrapped"])
+def test_a_model_that_was_turned_is_saved_like_that(visitor, tmp_path, step):
+    V, Q = quads()
+    caps = [np.arange(24), np.arange(24)[::-1] + 12 * 24]
+    visitor.does("load", {"content": np.frombuffer(as_obj(V, [*Q[:, ::-1], *caps]), np.uint8)}, name="ball.obj")
+    assert visitor.last("map").header["inward"] == 1
+    visitor.does("turn")
+    if step == "unwrapped":
+        visitor.does("unwrap", resolution=512)
+    (tmp_path / "map.obj").write_bytes(visitor.files()["map.obj"])
+    saved = io.read_mesh(tmp_path / "map.obj")
+    assert inspect_mesh(saved.V, saved.F).inward == 0
+    assert saved.rings.sizes.max() >= 4
+    assert atlas.certify(io.mapped(saved)).injective
+
+
+@pytest.mark.slow
+def test_the_rest_of_a_map_is_unwrapped_like_a_whole_model(visitor):
+    V, Q = quads()
+    V = V + np.random.default_rng(5).normal(0, 0.05, V.shape)
+    visitor.does("load", {"content": np.frombuffer(as_obj(V, Q, 2, "ab"), np.uint8)}, name="band.obj")
+    faces = [line.split() for line in visitor.files()["map.obj"].decode().splitlines() if line.startswith("f ")]
+    assert [len(face) for face in faces] == [5] * len(Q)
+    state = setup.open_without_map(visitor.session.state.sheet)
+    meridian = np.stack([12 + 24 * np.arange(12), 36 + 24 * np.arange(12)], axis=1)
+    drawn = replace(state, drawn=meridian)
+    for plan, options in ((drawn, {}), (state, {"labels": "groups"})):
+        seams = setup.unwrap_model(plan, **options).mesh.seams
+        wanted = meridian if plan is drawn else np.stack([144 + np.arange(24), 144 + np.arange(1, 25) % 24], axis=1)
+        assert are_sides(np.sort(wanted), np.pad(np.sort(seams), [(0, 0), (0, 1)], mode="edge"), len(V)).all()
+    with pytest.raises(RequestError, match="the file has no materials"):
+        setup.unwrap_model(state, labels="materials")
+
+
+def test_names_of_drawings_are_no_options(visitor):
+    drawing = b'<svg xmlns="http://www.w3.org/2000/svg"><path d="M0 0h9v9h-9z"/></svg>'
+    visitor.does("drawing", {"content": np.frombuffer(drawing, np.uint8)}, name="-drop.svg")
+    assert "--to drop.svg" in visitor.session.state.recipe.command
 
 
 @pytest.mark.slow

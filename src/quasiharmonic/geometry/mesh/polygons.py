@@ -66,6 +66,13 @@ class Polygons:
         """Index of the polygon of each triangle; (f,) int64."""
         return repeat_each(np.arange(len(self)), self.sizes - 2)
 
+    def turn_over(self) -> Polygons:
+        """Reversed polygons, of triangles whose last two corners are exchanged."""
+        ring = repeat_each(np.arange(len(self)), self.sizes)
+        backwards = (self.starts[:-1] + self.starts[1:] - 1)[ring] - np.arange(len(self.corners))
+        triangle, corner = np.divmod(self.corners[backwards], 3)
+        return Polygons(3 * triangle + -corner % 3, self.starts)
+
     def divide(self, divided: BoolArray) -> Polygons:
         """Polygons of which those in a mask (p,) are replaced by their triangles."""
         rings = np.split(self.corners, self.starts[1:-1])

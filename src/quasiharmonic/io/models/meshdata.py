@@ -183,6 +183,20 @@ class MeshData:
         """Return the same mesh with the texture coordinates of a `SeamedMesh` that has the same triangles."""
         return replace(self, vt=mapped.uv, FT=mapped.FT)
 
+    def turn_over(self) -> MeshData:
+        """Return the same mesh with all faces reversed, without normals and other data of its file."""
+        turn = [0, 2, 1]
+        return replace(
+            self,
+            F=self.F[:, turn],
+            FT=None if self.FT is None else self.FT[:, turn],
+            normals=b"",
+            FN=None,
+            polygons=None if self.polygons is None else self.polygons.turn_over(),
+            lower_maps=tuple(places[:, turn] for places in self.lower_maps),
+            carried=None,
+        )
+
     def as_plane(self, uv: ArrayLike) -> MeshData:
         """Return a map alone, as a mesh in the plane z = 0 with the same faces and no other data.
 

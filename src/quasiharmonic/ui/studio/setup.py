@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.model_files import polygon_costs, statement_labels
+from quasiharmonic.apps.unwrapping.model_files import label_statements, polygon_costs, statement_labels
 from quasiharmonic.apps.unwrapping.result import UnwrapStatus, UnwrapStep
 from quasiharmonic.apps.unwrapping.unwrap import unwrap
+from quasiharmonic.geometry.mesh.topology import are_sides
 from quasiharmonic.io import read_mesh
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.targets import nearest_on_boundary
@@ -32,7 +33,7 @@ from quasiharmonic.ui.studio.recipes import FACES, FORBIDDEN, SEAMS, Code, Given
 from quasiharmonic.ui.studio.state import IslandState, SessionState
 from quasiharmonic.ui.studio.surface import PageSurface
 from quasiharmonic.ui.studio.validation import RequestError, make_outline
-from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.options import UnwrapOptions
 
 # Keywords of the statements that divide an OBJ file into parts.
@@ -95,7 +96,7 @@ def unwrap_model(
         if source.start is not None:
             raise RequestError("the file's parts are unknown after the mesh has changed: undo, or choose no parts")
         words = _LABELS[which]
-        labels = statement_labels(sheet.mesh, *words)
+        labels = _label_triangles(sheet, which)
         options["labels"] = Given(labels, public(statement_labels)(model, *words), {"labels": which})
     if state.drawn is not None and len(state.drawn):
         options["seams"] = recipes.saved_rows(SEAMS, "seams", state.drawn)
@@ -123,12 +124,30 @@ def _unwrap_rest(
     assert sheet.mesh.vt is not None
     assert sheet.mesh.FT is not None
     FT, uv = sheet.from_file(sheet.mesh.FT).copy(), sheet.mesh.vt
-    result = unwrap(surface.V, surface.F[sheet.unmapped], callback=callback, **options)
+    F = surface.F[sheet.unmapped]
+    if which := options.get("labels"):
+        labels = np.repeat(_label_triangles(sheet, which)[:, None], 3, axis=1)
+        options = {**options, "labels": sheet.from_file(labels)[sheet.unmapped, 0]}
+    for name, edges in (("seams", state.drawn), ("no_seams", state.forbidden)):
+        if edges is not None and len(edges):
+            options = {**options, name: edges[are_sides(edges, F, len(surface.V))]}
+    costs = polygon_costs(sheet.mesh) if sheet.is_file else None
+    if costs is not None:
+        options = {**options, "edge_costs": costs[sheet.unmapped]}
+    result = unwrap(surface.V, F, callback=callback, **options)
     right = np.ceil(uv[np.delete(FT, sheet.unmapped, axis=0), 0].max())
     FT[sheet.unmapped] = result.indices + len(uv)
     mapped = SeamedMesh(surface.V, surface.F, FT, np.concatenate([uv, result.uvs + np.array([right, 0.0])]))
     after = as_it_is(state, mapped, saved_start(mapped))
     return replace(after, from_file=False, selected=tuple(range(len(after.islands))))
+
+
+def _label_triangles(sheet: PageSurface, which: str) -> IntArray:
+    """Return the part (f,) of each of the file's triangles; RequestError if the file has no such parts."""
+    words = _LABELS[which]
+    if not any(label_statements(sheet.mesh, word)[1] for word in words):
+        raise RequestError(f"the file has no {which}: choose other parts, or none")
+    return statement_labels(sheet.mesh, *words)
 
 
 def open_without_map(sheet: PageSurface) -> SessionState:

@@ -31,7 +31,7 @@ class PageSurface:
     """Model of a page.
 
     The functions that map accept only surfaces. So a model with defects is cleaned first, and the cleaned surface is
-    mapped. Files that are written have the model's own vertices and faces.
+    mapped. Files that are written have the model's own vertices and faces, all reversed if the user has turned it over.
     """
 
     name: str  # File name without folder
@@ -89,11 +89,15 @@ class PageSurface:
         return corners[:, (0, 2, 1)] if self.turned else corners
 
     def mapped_file(self, mesh: SeamedMesh) -> io.MeshData:
-        """Return the file's mesh with a map of the surface; polygons that seams cross become triangles."""
+        """Return the file's mesh with a map of the surface, turned over if the surface is.
+
+        Polygons that seams cross become triangles.
+        """
         FT = mesh.FT[:, (0, 2, 1)] if self.turned else mesh.FT
         if self.cleaned is not None:
             FT = self.cleaned.restore_corners(FT)
-        return divide_polygons(replace(self.mesh, vt=mesh.uv, FT=FT))[0]
+        mapped = divide_polygons(replace(self.mesh, vt=mesh.uv, FT=FT))[0]
+        return mapped.turn_over() if self.turned else mapped
 
     def turn_over(self) -> PageSurface:
         """Return the model with the triangles of its surface reversed."""

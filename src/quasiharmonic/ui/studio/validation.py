@@ -147,7 +147,7 @@ def make_outline(word: object) -> Outline:
 
 def read_drawing(name: str, content: bytes) -> Outline:
     """Return the outline of an uploaded SVG drawing; ValueError if it is not a valid drawing, or too large."""
-    shown = re.sub(r"[^\w.-]", "_", PurePosixPath(name.replace("\\", "/")).stem)[:60].strip(".") or "drawing"
+    shown = re.sub(r"[^\w.-]", "_", PurePosixPath(name.replace("\\", "/")).stem)[:60].strip(".-") or "drawing"
     if len(content) > MAX_BYTES:
         raise ValueError(f"{shown}.svg has {len(content):,} bytes; at most {MAX_BYTES:,} are allowed")
     with stored_file("dropped.svg", content) as path:
