@@ -225,6 +225,10 @@ def test_remesh_is_advised_where_the_quality_is_lost(height, advised):
         (["--group", "2", "--translate", "1,0,0"], "--translate must have 2 numbers"),
         (["--group", "2", "--axis", "0,0,1"], "--axis is for meshes in space"),
         (["--group", "2", "--centre", "0,0", "--centre", "1,0"], "--centre is given twice"),
+        (
+            ["--group", "2", "--translate", "0,0", "--centre", "0,0"],
+            "--centre of --group 2 has no effect without --rotate or",
+        ),
         (["--group", "2", "--scale", "2", "--group", "both"], "another one that moves differently"),
     ],
 )

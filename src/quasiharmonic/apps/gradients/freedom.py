@@ -19,13 +19,14 @@ import numpy as np
 
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.energies.newton.sliding_boundary import SlidingSystem
+from quasiharmonic.energies.newton.sliding_boundary import BARRIER_WEIGHT, SlidingSystem
 from quasiharmonic.geometry.curves.boundary_curves import Track
 from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, work
 
-# Step for differences of the barrier's gradient, relative to the curve's length.
+# Step for differences of the barrier's gradient, relative to the mean length of a boundary edge: the curve's length
+# divided by the number of sliding vertices.
 _STEP = 1e-6
 
 
@@ -34,6 +35,9 @@ class Freedom:
 
     ``tangent`` (l,) are unit directions of the lines of the ``sliding`` vertices (l,). ``system`` is the linear system
     of the unknowns. ``resting`` tells whether a sliding vertex stays at its position, at a kink or an end of its curve.
+
+    The calls of one step have this order: `prepare` at the current map, `gradient`, `advance` for each trial, `extra`
+    for the value of the last trial, and `keep` for the trial that is accepted.
     """
 
     resting = False
@@ -96,14 +100,11 @@ class SlidingFreedom(Freedom):
     def __init__(
         self, energy: DeformationEnergy, track: Track, domain: Domain, exponent: int, linear_solver: str
     ) -> None:
-        # Weight of the barrier that keeps the boundary near its curves, relative to the energy; as in
-        # `energies.newton.sliding_boundary`.
-        weight = 1e-2
         held = np.setdiff1d(domain.fixed, track.vertices)
         super().__init__(energy, len(track.uv), held, linear_solver, track.vertices)
         self._track, self._s, self._there = track, track.s, track.s
         self._deviation, self._unit = DeviationBarrier(track, domain.loops, exactly=True), 2.0**exponent
-        self._weight = weight * energy.value(in_units(track.uv, exponent))
+        self._weight = BARRIER_WEIGHT * energy.value(in_units(track.uv, exponent))
         self._both = (self._deviation.pairs >= 0).all(axis=1)
         self.system.couple(self._deviation.pairs[self._both])
 
@@ -167,7 +168,11 @@ class SlidingFreedom(Freedom):
 
     @cached_property
     def _colours(self) -> IntArray:
-        """A colouring of the sliding vertices with three colours; no edge joins two of the same colour."""
+        """A colouring of the sliding vertices with three colours; no edge joins two of the same colour.
+
+        The vertices are numbered along their curves, so colours alternate, except where a closed curve or the numbers
+        of two curves meet.
+        """
         colours = np.arange(self._s.size) % 2
         one, other = self._deviation.pairs[self._both].T
         colours[other[colours[one] == colours[other]]] = 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypedDict, Unpack
+from typing import NamedTuple, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,8 +51,12 @@ from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, map_ar
 from quasiharmonic.util.options import MorphOptions, PolishOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
-#: Curves of the boundary, and the nodes that do not slide.
-_Slide = tuple[bool | BoundaryCurves, IntArray]
+
+class _Slide(NamedTuple):
+    """How the boundary slides: along its polygon (True), not (False), or along curves; and the nodes that do not."""
+
+    curves: bool | BoundaryCurves
+    held: IntArray
 
 
 class MorphKeywords(TypedDict, total=False):
@@ -163,16 +167,18 @@ def morph(
     """
     checked = MorphOptions(**options)
     slide, rest, start = checked.slide, checked.rest, checked.start
+    if checked.energy is not None:
+        find_energy(checked.energy)
     if is_volume(points, F):
         if isinstance(slide, BoundaryCurves):
             raise ValueError("slide must be a bool or an array of planes for tetrahedra, not BoundaryCurves")
-        if checked.energy is not None:
-            find_energy(checked.energy)
         check_name(checked.linear_solver)
         return morph_tetrahedra(points, F, moved_vertices, target, checked)
     if not isinstance(slide, bool | np.bool_ | BoundaryCurves):
         raise ValueError(f"slide must be a bool or BoundaryCurves for planar meshes, not {slide!r}")
     curves = slide if isinstance(slide, BoundaryCurves) else bool(slide)
+    if curves is not False and checked.energy is None:
+        raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
     points = map_array("points", points, finite=False)
     F = element_array(F, len(points))
     used = np.unique(F)
@@ -188,7 +194,7 @@ def morph(
         loops = boundary_loops(nets_of(F)[-1], len(points))
         goal = make_way(curves, loops, points, there, np.asarray(moved_vertices))[fixed]
     search = _NodeSearch(F, first, fixed, nets_of(F), checked)
-    after, result = search.place(points, goal, begin, (curves, np.asarray(moved_vertices)))
+    after, result = search.place(points, goal, begin, _Slide(curves, np.asarray(moved_vertices)))
     # Fix the boundary at the positions to which it has slid.
     alone = replace(search, options=replace(checked, callback=None, slide=False, rest=None, start=None))
     inverted = inverted_elements(F, after)
@@ -220,18 +226,18 @@ class _NodeSearch:
         """Place all nodes by the first set of triangles that leaves no element inverted, or by the best one.
 
         Nodes in no element, and mid-side nodes on a sliding boundary, are at ``points`` (n, 2). ``target`` (k, 2) has
-        the positions of the fixed nodes, and ``begin`` is the initial mesh. ``slide`` has the curves of the boundary,
-        and the nodes that do not slide.
+        the positions of the fixed nodes, and ``begin`` is the initial mesh. If the boundary of six-node triangles
+        slides, all nodes are first placed on the triangles between all nodes, then those inside again.
         """
         F, fixed, nets = self.F, self.fixed, self.nets
-        if F.shape[1] == 6 and slide[0] is not False:
+        if F.shape[1] == 6 and slide.curves is not False:
             # Mid-side nodes slide as other nodes do. They are then moved to the middle of their sides and fixed there.
             there, slid = self._search(nets[-1], points, target, begin, slide)
             has_slid = fixed[(there[fixed] != target).any(axis=1)]
             before = points.copy()
             before[fixed] = target
-            there = centre_midsides(F, there, has_slid, _list_curves(slide[0], nets[-1], before))
-            after, result = self.place(points, there[fixed], there, (False, fixed))
+            there = centre_midsides(F, there, has_slid, _list_curves(slide.curves, nets[-1], before))
+            after, result = self.place(points, there[fixed], there, _Slide(False, fixed))
             return after, result.after(slid)
         best, least = None, np.inf
         for triangles in nets:
@@ -251,7 +257,7 @@ class _NodeSearch:
 
     def place_at_once(self, target: FloatArray) -> FloatArray:
         """Return the positions (n, 2) after one step from the rest mesh; NaN if an element is inverted."""
-        whole, _ = self.place(self.rest, target, None, (False, self.fixed))
+        whole, _ = self.place(self.rest, target, None, _Slide(False, self.fixed))
         return np.full_like(whole, np.nan) if inverted_elements(self.F, whole).size else whole
 
     def _search(
@@ -265,12 +271,8 @@ class _NodeSearch:
         own, own_fixed = np.searchsorted(used, triangles), np.searchsorted(used, fixed[known])
         # With the mesh's own reference triangles, the search starts from the harmonic extension of the displacement.
         problem = Problem(self.rest[used], own, own_fixed, target[known], reference="corrected")
-        curves = _select_curves(slide[0], problem, used, slide[1])
+        curves = _select_curves(slide.curves, problem, used, slide.held)
         corners = np.searchsorted(used, corner_triangles(F)[0]) if F.shape[1] == 4 else None
-        if energy is not None:
-            find_energy(energy)
-        elif curves is not False:
-            raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
         if curves is not False:
             problem = move_onto(curves, problem)
         start, iterations = None if begin is None else begin[used], self.options.max_iterations

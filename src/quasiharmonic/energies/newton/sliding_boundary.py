@@ -37,7 +37,7 @@ from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, invert_indices, reject
 
 # Weight of the barrier, as a share of the current energy.
-_WEIGHT = 1e-2
+BARRIER_WEIGHT = 1e-2
 # Minimum of an edge's distance to the barrier's bound after a step, as a share of the distance before it. Next to the
 # bound, derivatives from interpolated curves are too inaccurate to find a direction of descent.
 _LEAST_ROOM = 0.3
@@ -213,7 +213,7 @@ class SlidingModel(MapModel):
     def prepare(self, state: NewtonState) -> NewtonState:
         """Set the barrier's weight to its share of the current energy, which only decreases."""
         boundary: _Boundary = state.extra
-        self.weight = _WEIGHT * boundary.energy
+        self.weight = BARRIER_WEIGHT * boundary.energy
         return state._replace(value=boundary.energy + self.weight * self.deviation_barrier.value(boundary.s))
 
     def gradient(self, state: NewtonState) -> ComplexArray:

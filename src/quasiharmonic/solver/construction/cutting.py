@@ -255,6 +255,8 @@ class Cutting:
         path = walk(self.sheet, self._guide, start, end)
         self._place_along(path, self._target[a], self._target[b])
         right = self.sheet.cut(path)
+        # The sheet has numbered new copies, on the right of the cut, in the order of the walk; the last one only if the
+        # end was doubled, too. They have the same positions in the guide.
         self._guide += [self._guide[copy] for copy in path[: len(self.sheet.vertex) - len(self._guide)]]
         # To the right of the cut, corners use the right copies: iterate clockwise around a and counterclockwise around
         # b.

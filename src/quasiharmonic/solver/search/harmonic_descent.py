@@ -47,7 +47,7 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 
 class HarmonicDescentTuning(NamedTuple):
-    """Numbers that tune the descent to a harmonic map."""
+    """Numbers that tune the rounds of `HarmonicDescent`."""
 
     # Fraction of a round's evaluations for VectorAdam.
     probing: float = 0.4
@@ -67,6 +67,9 @@ UNTANGLING_STEPS = 40
 
 class HarmonicDescent:
     """The current map, the best map so far, and the rounds that improve them.
+
+    Two things pass from one round to the next: the last iterate, where the next round starts, and the mean squares of
+    each triangle's gradient, which tell its stiffness.
 
     Parameters
     ----------
@@ -148,7 +151,7 @@ class HarmonicDescent:
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
-        """Record a stage; end it if the Laplacian is not positive definite."""
+        """Record a stage. It ends silently, as if its block were left, if the Laplacian is not positive definite."""
         run, done, best = self._run, len(self._run.history), self.best
         try:
             yield

@@ -155,7 +155,7 @@ def _read_quality(path: Path) -> tuple[FemMesh, NDArray[np.float64]]:
 def _reject(options: argparse.Namespace, *names: str, **written: str) -> None:
     """Raise ValueError for options that have no meaning for finite-element meshes; some are ``written`` differently."""
     for name, option in {**{name: "--" + name.replace("_", "-") for name in names}, **written}.items():
-        if getattr(options, name) not in (None, False):
+        if getattr(options, name) is not None and getattr(options, name) is not False:
             raise ValueError(f"{option} needs a surface with a map: omit it for {options.input.suffix} files")
 
 
@@ -238,6 +238,14 @@ def list_motions(given: list[tuple[str, Any]], axes: int) -> list[GroupMotion]:
             setattr(last, option, value)
         else:
             last.steps.append((option, value))
+    for one in motions:
+        users = {"axis": ("rotate",), "centre": ("rotate", "scale")}
+        for option, of in users.items():
+            if getattr(one, option) is not None and not any(step in of for step, _ in one.steps):
+                needed = " or ".join(f"--{step}" for step in of)
+                raise ValueError(
+                    f"--{option} of --group {one.name} has no effect without {needed}: add it, or omit this"
+                )
     return motions
 
 

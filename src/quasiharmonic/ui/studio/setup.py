@@ -39,6 +39,8 @@ from quasiharmonic.util.options import UnwrapOptions
 # Keywords of the statements that divide an OBJ file into parts.
 _LABELS = {"groups": ("o", "g"), "materials": ("usemtl",)}
 _FIRST_OUTLINE = "rect:1x1"
+# Options that the recorded command states in any case.
+_DEFAULTS = {"max_stretch": 1.5, "resolution": 2048, "padding": 4.0}
 #: Larger models are not cut and mapped before the user asks, because this takes longer than some seconds.
 MAX_AUTOMATIC = 40_000
 
@@ -68,12 +70,16 @@ def unwrap_model(
 
     With ``keep_seams`` the seams of the map are kept. With ``selected`` only the selected islands are unwrapped.
     Triangles that have texture coordinates in the file keep them if there is no map yet.
+
+    The command starts from the file, with its polygons, if the page shows the file's surface, or a cleaned one without
+    drawn seams; `unwrap` then cleans the file's mesh in the same way. Otherwise it starts from a saved file with the
+    surface: if a map is kept in part, if the model is turned over, or if seams were drawn on a cleaned surface.
     """
     sheet = state.sheet
     if not state.mapped and len(sheet.unmapped):
         return _unwrap_rest(state, callback, given)
     script, model = Script(), Code("model")
-    options = {"max_stretch": 1.5, "resolution": 2048, "padding": 4.0, **given}
+    options = {**_DEFAULTS, **given}
     if options.get("symmetry", "") is None:
         options["symmetry"] = Given(None, None, {"symmetry": "none"})
     some = selected and state.mapped and len(state.selected) < len(state.islands)

@@ -45,7 +45,7 @@ class BitmapTuning(NamedTuple):
     many_per_tile: int = 20
     # The number of cells along a tile is at least this multiple of the expected number.
     fewest_cells: float = 0.8
-    # Cells need not be smaller than this fraction of a texel, whose padding would have many of them.
+    # At most this many cells along a texel; with smaller ones the padding would have many cells.
     cells_per_texel: int = 4
     # Few charts have sixteen directions each up to this number, and eight above.
     sixteen_directions: int = 20
@@ -135,7 +135,8 @@ class BitmapSearch:
         turns = turns if few and skewed else turns[:1]
         self._bitmaps: dict[int, Bitmaps] = {}
         self._halves: dict[tuple[int, int], Bitmaps] = {}
-        # Where the last of several shapes was placed, by the number of cells and the order of these shapes.
+        # Where the last of several shapes was placed, by the number of cells and the shapes so far with their halves.
+        # These determine the boards, so the place is the same in each trial.
         self._spots: dict[tuple[int, ...], tuple[int, Spot] | None] = {}
         for i in large.tolist():
             if given is not None or not rotate:
