@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quasiharmonic import io
+from quasiharmonic.surfaces import grid
 from shared.commands import run
 
 
@@ -107,6 +109,15 @@ class TestReportFailures:
         assert run("plot", out, "-o", tmp_path / "again.png", "--kind", "distortion") == 0
         # The picture is the same as that of the written file.
         np.testing.assert_array_equal(imread(picture), imread(tmp_path / "again.png"))
+
+    @pytest.mark.slow
+    def test_all_islands_are_drawn_if_one_was_mapped(self, tmp_path):
+        (V, F), (W, G) = grid(8, 8), grid(5, 5)
+        two = io.MeshData(np.concatenate([V, W + [3, 0]]), np.concatenate([F, G + len(V)]))
+        io.write_obj(tmp_path / "two.obj", two.with_map(two.V[:, :2]))
+        call = "map", tmp_path / "two.obj", "--to", "disk", "--islands", "1", "-o", tmp_path / "o.obj"
+        for more in ((), ("--refine",), ("--kind", "distortion")):
+            assert run(*call, "--plot", tmp_path / "p.png", *more) == 0
 
     @pytest.mark.slow
     def test_no_first_map_to_draw(self, star, tmp_path, monkeypatch):

@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
         io.write_mapped(output, io.MeshData(V, F).with_places(mapped.mesh))
     with report.after_writing(output):
         written = written_map.certify_map(io.read_mesh(output))
-        map.draw(folder / "demo.png", written, [problem], mapped)
+        map.draw(folder / "demo.png", written, problem, mapped)
         facts = {**mapped.to_dict(), **written.to_dict(), **report.sizes(problem.domain)}
         report.emit(facts, str(folder / "demo.json"), written_map.describe_maps(mapped, written, output))
         print(f"also wrote {folder / 'demo.png'} and {folder / 'demo.json'}", flush=True)

@@ -141,6 +141,8 @@ def _map(
             fine = on_refinement(problem, result.refined)
             given = {"linear_solver": options.linear_solver, "slide": one.slide}
             left = None if options.time_limit is None else options.time_limit - result.seconds
+            if left is not None and left <= 0:
+                return result
             with process.progress_line() as show:
                 return run_within(left, lambda: smooth(fine, result, callback=show, **given))
         return result
@@ -158,8 +160,7 @@ def _map(
     def describe(written: MeshData) -> pipeline.Account:
         certified = written_map.certify_map(written)
         if options.plot is not None:
-            problems = zip((one.fitted.problem for one in posed), refined, strict=False)
-            draw(options.plot, certified, [on_refinement(*one) for one in problems], mapped, options.kind)
+            draw(options.plot, certified, posed[0].fitted.problem, mapped, options.kind)
         added = sum(one.result.added for one in mapped.islands)
         filled = sum(one.fitted.filled_holes for one in posed)
         facts = {
@@ -191,16 +192,19 @@ def _map(
     return pipeline.Changed(new, describe)
 
 
-def draw(path: Path, certified: WrittenMap, problems: list[Problem], mapped: MappedAtlas, kind: str = "map") -> None:
-    """Draw the rest surface, Tutte's embedding if there is one island, and the map; or the distortion."""
+def draw(path: Path, certified: WrittenMap, problem: Problem, mapped: MappedAtlas, kind: str = "map") -> None:
+    """Draw the rest surface, Tutte's embedding if there is one island, and the map; or the distortion.
+
+    ``problem`` is that of the first island that was mapped, before its refinement.
+    """
     import numpy as np
 
     from quasiharmonic.linsolve import NotPositiveDefinite
     from quasiharmonic.solver.mapping import quasi_harmonic_map
+    from quasiharmonic.solver.refinement import on_refinement
     from quasiharmonic.ui.plot import save_distortion_figure, save_map_figure
 
     V, F, uv = certified.V, certified.F, certified.uv
-    problem = problems[0]
 
     def to_frame(uv: NDArray[np.float64]) -> NDArray[np.float64]:
         return problem.frame.inward(uv).view(np.float64).reshape(-1, 2)
@@ -212,10 +216,12 @@ def draw(path: Path, certified: WrittenMap, problems: list[Problem], mapped: Map
     rest = scale_down(V)
     if kind == "distortion":
         return save_distortion_figure(path, rest, F, scale_down(uv))
-    if len(problems) > 1:
+    if len(mapped.islands) > 1:
         return save_map_figure(path, rest, F, to_frame(uv), inverted=certified.inverted)
+    result = mapped.islands[0].result
+    problem = on_refinement(problem, result.refined)
     try:
-        tutte = to_frame(quasi_harmonic_map(problem, linear_solver=mapped.islands[0].result.linear_solver))
+        tutte = to_frame(quasi_harmonic_map(problem, linear_solver=result.linear_solver))
     except NotPositiveDefinite:
         tutte = None
     save_map_figure(path, rest, F, to_frame(uv), tutte, inverted=certified.inverted, fixed=problem.fixed)
