@@ -113,7 +113,7 @@ class TestReportFailures:
     @pytest.mark.slow
     def test_all_islands_are_drawn_if_one_was_mapped(self, tmp_path):
         (V, F), (W, G) = grid(8, 8), grid(5, 5)
-        two = io.MeshData(np.concatenate([V, W + [3, 0]]), np.concatenate([F, G + len(V)]))
+        two = io.MeshData(np.concatenate([V, W + np.array([3, 0])]), np.concatenate([F, G + len(V)]))
         io.write_obj(tmp_path / "two.obj", two.with_map(two.V[:, :2]))
         call = "map", tmp_path / "two.obj", "--to", "disk", "--islands", "1", "-o", tmp_path / "o.obj"
         for more in ((), ("--refine",), ("--kind", "distortion")):
