@@ -73,10 +73,13 @@ def sort_edges(F: IntArray, n: int, pairs: IntArray, sizes: IntArray) -> int:
     key = edge_keys(tail, head, n)
     key *= 2
     key += tail > head
+    del tail, head
     key.sort()
     direction = (key & 1).astype(bool)
     key >>= 1
-    first = np.flatnonzero(np.diff(key, prepend=-1))
+    starts = np.ones(key.size, dtype=bool)
+    np.not_equal(key[1:], key[:-1], out=starts[1:])
+    first = np.flatnonzero(starts)
     count = np.diff(first, append=key.size)
     pair, single = first[count == 2], first[count == 1]
     opposed = direction[pair] != direction[pair + 1]
