@@ -188,13 +188,14 @@ def morph(
     F = _orient_counterclockwise(F, first)
     check_spread(F, len(points))
     fixed, goal = _find_fixed(points, F, moved_vertices, target)
+    nets, moved = nets_of(F), np.asarray(moved_vertices)
     if curves is not False:
         there = points.copy()
         there[fixed] = goal
-        loops = boundary_loops(nets_of(F)[-1], len(points))
-        goal = make_way(curves, loops, points, there, np.asarray(moved_vertices))[fixed]
-    search = _NodeSearch(F, first, fixed, nets_of(F), checked)
-    after, result = search.place(points, goal, begin, _Slide(curves, np.asarray(moved_vertices)))
+        loops = boundary_loops(nets[-1], len(points))
+        goal = make_way(curves, loops, points, there, moved)[fixed]
+    search = _NodeSearch(F, first, fixed, nets, checked)
+    after, result = search.place(points, goal, begin, _Slide(curves, moved))
     # Fix the boundary at the positions to which it has slid.
     alone = replace(search, options=replace(checked, callback=None, slide=False, rest=None, start=None))
     inverted = inverted_elements(F, after)

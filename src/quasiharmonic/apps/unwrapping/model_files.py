@@ -19,6 +19,8 @@ from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_expo
 
 C = TypeVar("C", bound=Callable[..., Any])
 
+#: Kinds of parts of a model, by the keywords of the statements of OBJ files that begin them.
+PARTS = {"groups": ("o", "g"), "materials": ("usemtl",)}
 # Factor on the cost of a seam inside a polygon, which the file cannot store.
 _INSIDE_POLYGON = 1e3
 # Unit normals that differ by less are equal up to rounding in files.
@@ -45,6 +47,11 @@ def corner_positions(mesh: MeshData) -> FloatArray:
     if mesh.vt is None or mesh.FT is None:
         raise ValueError("the file has no texture coordinates (vt) to keep: omit --keep-seams and --faces")
     return np.where(mesh.FT[:, :, None] >= 0, mesh.vt[mesh.FT], np.nan)
+
+
+def has_parts(mesh: MeshData, which: str) -> bool:
+    """Whether a mesh has parts of a kind in `PARTS`."""
+    return any(label_statements(mesh, keyword)[1] for keyword in PARTS[which])
 
 
 def statement_labels(mesh: MeshData, *keywords: str) -> IntArray:

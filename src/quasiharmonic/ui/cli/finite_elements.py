@@ -155,7 +155,8 @@ def _read_quality(path: Path) -> tuple[FemMesh, NDArray[np.float64]]:
 def _reject(options: argparse.Namespace, *names: str, **written: str) -> None:
     """Raise ValueError for options that have no meaning for finite-element meshes; some are ``written`` differently."""
     for name, option in {**{name: "--" + name.replace("_", "-") for name in names}, **written}.items():
-        if getattr(options, name) is not None and getattr(options, name) is not False:
+        value = getattr(options, name)
+        if value is not None and value is not False:
             raise ValueError(f"{option} needs a surface with a map: omit it for {options.input.suffix} files")
 
 
@@ -239,8 +240,7 @@ def list_motions(given: list[tuple[str, Any]], axes: int) -> list[GroupMotion]:
         else:
             last.steps.append((option, value))
     for one in motions:
-        users = {"axis": ("rotate",), "centre": ("rotate", "scale")}
-        for option, of in users.items():
+        for option, of in (("axis", ("rotate",)), ("centre", ("rotate", "scale"))):
             if getattr(one, option) is not None and not any(step in of for step, _ in one.steps):
                 needed = " or ".join(f"--{step}" for step in of)
                 raise ValueError(

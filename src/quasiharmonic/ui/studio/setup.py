@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.model_files import label_statements, polygon_costs, statement_labels
+from quasiharmonic.apps.unwrapping.model_files import PARTS, has_parts, polygon_costs, statement_labels
 from quasiharmonic.apps.unwrapping.result import UnwrapStatus, UnwrapStep
 from quasiharmonic.apps.unwrapping.unwrap import unwrap
 from quasiharmonic.geometry.mesh.topology import are_sides
@@ -36,8 +36,6 @@ from quasiharmonic.ui.studio.validation import RequestError, make_outline
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.options import UnwrapOptions
 
-# Keywords of the statements that divide an OBJ file into parts.
-_LABELS = {"groups": ("o", "g"), "materials": ("usemtl",)}
 _FIRST_OUTLINE = "rect:1x1"
 # Options that the recorded command states in any case.
 _DEFAULTS = {"max_stretch": 1.5, "resolution": 2048, "padding": 4.0}
@@ -50,8 +48,8 @@ def read_options(frame: MessageFrame) -> dict[str, Any]:
     given = frame.header.get("options", {})
     if not isinstance(given, dict) or not set(given) <= set(NAMES):
         raise RequestError(f"options of unwrap are {', '.join(NAMES)}")
-    if given.get("labels", "groups") not in _LABELS:
-        raise RequestError(f"labels are {' or '.join(_LABELS)}")
+    if given.get("labels", "groups") not in PARTS:
+        raise RequestError(f"labels are {' or '.join(PARTS)}")
     if given.get("symmetry") == "none":
         given["symmetry"] = None
     UnwrapOptions(**given)
@@ -101,9 +99,8 @@ def unwrap_model(
     if which := given.get("labels"):
         if source.start is not None:
             raise RequestError("the file's parts are unknown after the mesh has changed: undo, or choose no parts")
-        words = _LABELS[which]
         labels = _label_triangles(sheet, which)
-        options["labels"] = Given(labels, public(statement_labels)(model, *words), {"labels": which})
+        options["labels"] = Given(labels, public(statement_labels)(model, *PARTS[which]), {"labels": which})
     if state.drawn is not None and len(state.drawn):
         options["seams"] = recipes.saved_rows(SEAMS, "seams", state.drawn)
     if len(state.forbidden):
@@ -150,10 +147,9 @@ def _unwrap_rest(
 
 def _label_triangles(sheet: PageSurface, which: str) -> IntArray:
     """Return the part (f,) of each of the file's triangles; RequestError if the file has no such parts."""
-    words = _LABELS[which]
-    if not any(label_statements(sheet.mesh, word)[1] for word in words):
+    if not has_parts(sheet.mesh, which):
         raise RequestError(f"the file has no {which}: choose other parts, or none")
-    return statement_labels(sheet.mesh, *words)
+    return statement_labels(sheet.mesh, *PARTS[which])
 
 
 def open_without_map(sheet: PageSurface) -> SessionState:

@@ -84,8 +84,7 @@ class PageSurface:
     def from_file(self, corners: IntArray) -> IntArray:
         """Return values at the corners of the file's triangles (f, 3) at those of the surface."""
         if self.cleaned is not None:
-            corners = corners[self.cleaned.triangles]
-            corners = np.where(self.cleaned.flipped[:, None], corners[:, (0, 2, 1)], corners)
+            corners = self.cleaned.take_corners(corners)
         return corners[:, (0, 2, 1)] if self.turned else corners
 
     def mapped_file(self, mesh: SeamedMesh) -> io.MeshData:

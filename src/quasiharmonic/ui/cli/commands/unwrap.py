@@ -297,17 +297,16 @@ def _labels_file(which: str | None) -> Path | None:
 
 def _labels(mesh: MeshData, which: str | None, option: str = "--labels") -> Any:
     """Return the labels (f,) of the triangles that an option names."""
-    from quasiharmonic.apps.unwrapping.model_files import label_statements, statement_labels
+    from quasiharmonic.apps.unwrapping.model_files import PARTS, has_parts, statement_labels
     from quasiharmonic.util.arrays import count_of
 
     if which is None:
         return None
     if (path := _labels_file(which)) is None:
-        keywords = {"groups": ("o", "g"), "materials": ("usemtl",)}[which]
-        if not any(label_statements(mesh, keyword)[1] for keyword in keywords):
+        if not has_parts(mesh, which):
             other = ", or give a file with the part of each face" if option == "--labels" else ""
             raise ValueError(f"the file has no {which}: omit {option}{other}")
-        return statement_labels(mesh, *keywords)
+        return statement_labels(mesh, *PARTS[which])
     labels = _read_integers(path, 1)[:, 0]
     if len(labels) != mesh.faces:
         raise ValueError(f"{path}: {count_of('number', 'numbers', len(labels))} for {mesh.faces} faces: give one each")
