@@ -203,7 +203,7 @@ def test_without_anywidget(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "anywidget", None)
     monkeypatch.delitem(sys.modules, "quasiharmonic.ui.notebook.widget", raising=False)
-    monkeypatch.delattr(notebook, "MapWidget", raising=False)
+    monkeypatch.delitem(vars(notebook), "MapWidget", raising=False)
     with pytest.raises(ImportError, match=r"pip install '.*\[notebook\]'"):
         notebook.MapWidget  # noqa: B018
     with pytest.raises(AttributeError):
