@@ -51,7 +51,7 @@ def test_the_number_of_grown_charts_is_known_before(bound):
 
 
 def test_time_to_pack_many_charts_is_reserved(monkeypatch):
-    module, seconds = sys.modules["quasiharmonic.apps.unwrapping.unwrap"], []
+    module, seconds = sys.modules["quasiharmonic.apps.unwrapping.stages"], []
     monkeypatch.setattr(module, "run_until", lambda left, compute: seconds.append(left))
     loose = np.random.default_rng(0).normal(size=(3000, 3))
     result = unwrap(loose, np.arange(3000).reshape(-1, 3), time_limit=60)

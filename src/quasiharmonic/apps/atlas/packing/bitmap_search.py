@@ -15,7 +15,7 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.packing.board import HALF_DIAGONAL, Bitmaps, Board, Occupied, Spot, count_cells, draw
 from quasiharmonic.apps.atlas.packing.shapes import Shape
-from quasiharmonic.util.arrays import ComplexArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
 #: More charts than this have four directions each, and are placed once; their boards are searched window by window.
@@ -222,59 +222,84 @@ class BitmapSearch:
         columns, rows = count_cells(size, texels)
         if self._least_cells > most * columns * rows:
             return None
-        boards: list[Board] = []
-
-        def open_board() -> Board:
-            board = Board(rows, columns, windows=self._windows)
-            if self._occupied is not None:
-                board.put(self._occupied.draw(len(boards), cells, self._radius), 0, 0)
-            boards.append(board)
-            return board
-
-        while self._occupied is not None and len(boards) < most:
-            open_board()
-
-        def find(bitmaps: Bitmaps) -> tuple[int, Spot] | None:
-            for tile, board in enumerate(boards):
-                if spot := board.find(bitmaps):
-                    return tile, spot
-            spot = open_board().find(bitmaps) if len(boards) < most else None
-            return None if spot is None else (len(boards) - 1, spot)
-
+        boards = _Boards(rows, columns, most, windows=self._windows)
+        if self._occupied is not None:
+            for tile in range(most):
+                boards.open().put(self._occupied.draw(tile, cells, self._radius), 0, 0)
         n = len(self.areas)
-        directions, centres, tiles = np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64)
-        placed: tuple[int, ...] = (cells,)
-        for i in (self._order[: self._drawn] if order is None else order).tolist():
+        layout = Layout(texels / self._cell, np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64))
+        drawn, boxes = self._order[: self._drawn] if order is None else order, self._order[self._drawn :]
+        if not self._place_bitmaps(boards, layout, (cells,), drawn, parts):
+            return None
+        sides = np.ceil(self._boxes + padding / texels).astype(np.int64)
+        tiles, corners = boards.fill_rows(sides)
+        if (tiles < 0).any():
+            return None
+        layout.directions[boxes], layout.tiles[boxes] = self._lying, tiles
+        layout.centres[boxes] = (corners + sides / 2) @ [1j, 1] * texels
+        return layout
+
+    def _place_bitmaps(
+        self, boards: _Boards, layout: Layout, placed: tuple[int, ...], order: IntArray, parts: IntArray | None
+    ) -> bool:
+        """Place shapes on boards in an order, and fill in their layout; return whether all fit."""
+        texels = layout.scale * self._cell
+        for i in order.tolist():
             heartbeat()
             part = 0 if parts is None else int(parts[i])
             bitmaps = self._select(i, part)
             # Orders of few shapes often begin alike.
             placed = (*placed, i, part)
             if placed not in self._spots:
-                self._spots[placed] = find(bitmaps)
+                self._spots[placed] = boards.find(bitmaps)
             found = self._spots[placed]
             if found is None:
-                return None
+                return False
             tile, spot = found
-            while tile >= len(boards):
-                open_board()
             bitmap = bitmaps.cells[spot.direction]
-            boards[tile].put(bitmap, spot.row, spot.column)
-            directions[i], tiles[i] = bitmaps.directions[spot.direction], tile
-            centres[i] = complex(spot.column + bitmap.shape[1] / 2, spot.row + bitmap.shape[0] / 2) * texels
-        rest = self._order[self._drawn :]
-        directions[rest] = self._lying
-        boxes = np.ceil(self._boxes + padding / texels).astype(np.int64)
-        waiting = np.arange(len(rest))
-        for tile in range(most):
+            boards.put(tile, bitmap, spot)
+            layout.directions[i], layout.tiles[i] = bitmaps.directions[spot.direction], tile
+            layout.centres[i] = complex(spot.column + bitmap.shape[1] / 2, spot.row + bitmap.shape[0] / 2) * texels
+        return True
+
+
+class _Boards:
+    """Boards of the tiles, at most ``most``. A board is opened where nothing fits on those before."""
+
+    def __init__(self, rows: int, columns: int, most: int, *, windows: bool) -> None:
+        self._sides, self._most, self._windows = (rows, columns), most, windows
+        self._boards: list[Board] = []
+
+    def open(self) -> Board:
+        """Return a further board, which is empty."""
+        self._boards.append(Board(*self._sides, windows=self._windows))
+        return self._boards[-1]
+
+    def find(self, bitmaps: Bitmaps) -> tuple[int, Spot] | None:
+        """Find the first tile with a free position for one of several bitmaps of a shape, and the position."""
+        for tile, board in enumerate(self._boards):
+            if spot := board.find(bitmaps):
+                return tile, spot
+        spot = self.open().find(bitmaps) if len(self._boards) < self._most else None
+        return None if spot is None else (len(self._boards) - 1, spot)
+
+    def put(self, tile: int, bitmap: BoolArray, spot: Spot) -> None:
+        """Occupy the cells of a bitmap at a position that `find` has returned, now or for equal boards."""
+        while tile >= len(self._boards):
+            self.open()
+        self._boards[tile].put(bitmap, spot.row, spot.column)
+
+    def fill_rows(self, boxes: IntArray) -> tuple[IntArray, IntArray]:
+        """Place boxes (k, 2) into free cells; return tiles (k,), -1 for those that do not fit, and corners (k, 2)."""
+        tiles, corners = np.full(len(boxes), -1), np.zeros((len(boxes), 2), dtype=np.int64)
+        for tile in range(self._most):
+            waiting = np.flatnonzero(tiles < 0)
             if not waiting.size:
                 break
-            board = boards[tile] if tile < len(boards) else open_board()
-            corners = board.fill_rows(boxes[waiting])
-            done = waiting[corners[:, 0] >= 0]
-            tiles[rest[done]] = tile
-            centres[rest[done]] = (corners[corners[:, 0] >= 0] + boxes[done] / 2) @ [1j, 1] * texels
-            if tile + 1 == len(boards) and not done.size:
+            board = self._boards[tile] if tile < len(self._boards) else self.open()
+            found = board.fill_rows(boxes[waiting])
+            done = found[:, 0] >= 0
+            tiles[waiting[done]], corners[waiting[done]] = tile, found[done]
+            if tile + 1 == len(self._boards) and not done.any():
                 break
-            waiting = waiting[corners[:, 0] < 0]
-        return None if waiting.size else Layout(texels / self._cell, directions, centres, tiles)
+        return tiles, corners
