@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from math import inf
 from typing import NamedTuple
 
@@ -35,7 +36,9 @@ class ConstructionTuning(NamedTuple):
     area_power: float = 0.5
     # Maximum ratio of weights in one update.
     max_ratio: float = 1e6
-    # Maximum number of added vertices per mesh vertex before another way to cut is tried.
+    # Near a bad map, walks may grow without end, because each runs along those before. So another way to cut is tried
+    # if more vertices are added than this, and so many per vertex of the mesh.
+    always_added: int = 2500
     added_per_vertex: int = 50
     # Final maximum of added vertices: walks around many displaced pins can grow without bound.
     max_added: int = 60_000
@@ -52,47 +55,50 @@ _TUNING = ConstructionTuning()
 _REPAIRS = LocalRepair(tries=30), Untangling(iterations=200), RandomRestarts(max_failures=20, tries=20)
 
 
-def embed_pieces(problem: Problem, w: ComplexArray, fixed: IntArray) -> ComplexArray:
+def embed_in_polygons(problem: Problem, w: ComplexArray, fixed: IntArray) -> ComplexArray:
     """Embed convex pieces into their polygons, and untangle triangles that rounding has inverted.
 
     ``w`` (n,) has the positions of the vertices on the boundaries of pieces, ``fixed`` (k,), in the problem's frame.
     Return the map with the fewest inverted triangles found, counted at its final positions.
     """
     best, fewest = w, len(problem.F) + 1
-    for candidate in _candidates(problem, w, fixed):
-        inverted = inverted_triangles(problem.F, problem.positions(candidate)).size
-        if inverted < fewest:
-            best, fewest = candidate, inverted
-        if fewest == 0:
-            break
-    return best
-
-
-def _candidates(problem: Problem, w: ComplexArray, fixed: IntArray) -> Iterator[ComplexArray]:
-    """Yield embeddings with different weights, then maps from untangling the best of them."""
-    weights, best, fewest = np.ones(len(problem.F)), w, np.inf
+    weights = np.ones(len(problem.F))
     for _ in range(1 + _TUNING.weight_updates):
         try:
             w = embed_tutte(problem.F, w, fixed, weights)
         except NotPositiveDefinite:
             break
-        yield w
-        inverted = inverted_triangles(problem.F, problem.positions(w)).size
-        if inverted < fewest:
+        if (inverted := _count_inverted(problem, w)) < fewest:
             best, fewest = w, inverted
+        if fewest == 0:
+            return best
         # Small triangles get smaller weights.
         areas = np.abs(signed_areas(problem.F, w))
         weights = weights * np.clip(areas / areas.max(), 1 / _TUNING.max_ratio, 1.0) ** _TUNING.area_power
+    return _untangle(problem, best)
+
+
+def _untangle(problem: Problem, w: ComplexArray) -> ComplexArray:
+    """Return the map with the fewest inverted triangles. Each repair starts where the one before it ends."""
+    best, fewest = w, _count_inverted(problem, w)
     objective = Objective(problem)
-    here = objective.of_map(best)
+    here = objective.of_map(w)
     for repair in _REPAIRS:
         try:
             for step in repair.iterates(objective, here):
-                again, here = step.w is here.w, step
-                if not again:
-                    yield here.w
+                moved, here = step.w is not here.w, step
+                if moved and (inverted := _count_inverted(problem, here.w)) < fewest:
+                    best, fewest = here.w, inverted
+                if fewest == 0:
+                    return best
         except NotPositiveDefinite:
-            return
+            break
+    return best
+
+
+def _count_inverted(problem: Problem, w: ComplexArray) -> int:
+    """Return how many triangles are not positive at the final positions of a map in the problem's frame."""
+    return int(inverted_triangles(problem.F, problem.positions(w)).size)
 
 
 def is_simple(problem: Problem) -> bool:
@@ -141,45 +147,44 @@ class Construction:
 
 
 def constructions(problem: Problem, best_map: FloatArray, *, patch: bool = False) -> Iterator[Construction]:
-    """Yield constructions near the best known map (n, 2) and without a guide, each better than the previous ones.
+    """Yield constructions near the best known map (n, 2) and without a guide, none worse than those before.
 
     The target satisfies `is_simple`. At least one construction is yielded; the last one adds the fewest vertices. A
     certified map is yielded before it is thinned. One with many added vertices is the last, and one with more than
     another is usually not thinned. A mesh usually gets fewer vertices without a guide, a ``patch`` near the best map.
     If every way to cut needs too many vertices, ``best_map`` is yielded with ``cut`` False.
     """
-    best: tuple[bool, int] | None = None
-
-    def is_better(made: Construction) -> bool:
-        nonlocal best
-        if best is not None and _rank(made) > best:
-            return False
-        best = _rank(made)
-        return True
-
-    fewest, large = inf, False
-    # Near a bad map walks may grow without end, because each runs along the previous ones.
-    first = _TUNING.added_per_vertex * (problem.n + _TUNING.added_per_vertex)
+    usual = _TUNING.always_added + _TUNING.added_per_vertex * problem.n
     guides = (best_map, None) if patch else (None, best_map)
-    for guide, limit in (*((guide, first) for guide in guides), (best_map, max(first, _TUNING.max_added))):
-        if best is not None and (limit > first or not best[1] or large):
+    best: Construction | None = None
+    # Vertices that each certified construction adds before it is thinned.
+    certified: list[int] = []
+    for guide, limit in *((guide, usual) for guide in guides), (best_map, max(usual, _TUNING.max_added)):
+        if best is not None and _is_final(best, certified, larger_limit=limit > usual):
             break
         steps = construct_and_thin(problem, guide, max_added=limit)
         try:
             made = next(steps)
         except TooManyError:
             continue
-        if is_better(made):
-            yield made
         added = len(made.refined.parents)
-        if added <= max(fewest, _TUNING.few_added):
-            yield from filter(is_better, steps)
+        worth_thinning = added <= max(min(certified, default=inf), _TUNING.few_added)
         if made.certificate.bijective:
-            fewest, large = min(added, fewest), added > _TUNING.many_added
+            certified.append(added)
+        for one in chain([made], steps if worth_thinning else []):
+            if best is None or _rank(one) <= _rank(best):
+                best = one
+                yield one
     if best is None:
         certificate = certify(problem.F, best_map, loops=problem.domain.loops)
         uncut = as_refined(problem.V, problem.F, problem.F, [])
         yield Construction(uncut, best_map, certificate, np.empty(0, dtype=np.int64), cut=False)
+
+
+def _is_final(best: Construction, certified: list[int], *, larger_limit: bool) -> bool:
+    """Whether no further construction is tried: none can be better, or it would take long, or need a larger limit."""
+    adds_nothing = not len(best.refined.parents)
+    return adds_nothing or max(certified, default=0) > _TUNING.many_added or larger_limit
 
 
 def _rank(made: Construction) -> tuple[bool, int]:
@@ -215,14 +220,14 @@ def construct_and_thin(
         yield certify_map(uncut, np.zeros((problem.n, 2)) if guide is None else np.ldexp(guide, -exponent))
         return
     near = None if guide is None else to_complex(np.ldexp(guide, -exponent))
-    refined, uv = _embed_pieces(unit, Cutting(unit, near, max_added))
+    refined, uv = _map_cut_mesh(unit, Cutting(unit, near, max_added))
     made = certify_map(refined, uv)
     yield made
     if len(refined.parents) and certify(refined.F, uv, loops=problem.domain.loops).bijective:
         yield certify_map(*thin_refinement(unit, refined, uv))
 
 
-def _embed_pieces(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArray]:
+def _map_cut_mesh(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArray]:
     """Return the cut mesh joined again, and the map of its pieces into convex polygons."""
     sheet = cutting.sheet
     triangles = np.array(sheet.vertex)[sheet.rows()]
@@ -234,7 +239,7 @@ def _embed_pieces(problem: Problem, cutting: Cutting) -> tuple[Refined, FloatArr
     for vertex in on_cuts.tolist():
         uv[vertex] = cutting.positions[vertex].real, cutting.positions[vertex].imag
     fixed = np.concatenate([problem.fixed, on_cuts])
-    return refined, fine.positions(embed_pieces(fine, fine.frame.inward(uv), fixed))
+    return refined, fine.positions(embed_in_polygons(fine, fine.frame.inward(uv), fixed))
 
 
 def _find_nearest(problem: Problem, F: IntArray, uv: FloatArray, certificate: Certificate) -> IntArray:
