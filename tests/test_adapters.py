@@ -14,6 +14,7 @@ import pytest
 import quasiharmonic
 from quasiharmonic import (
     InverseMap,
+    MovingMesh,
     Problem,
     atlas,
     boundary_loops,
@@ -351,6 +352,8 @@ def test_trimesh():
     assert distortion(mesh, injective_map(mesh, LOOP, BEAN)).inverted.size == 0
     with pytest.raises(ValueError, match="a Scene is not a mesh"):
         flatten(trimesh.Scene([mesh]))
+    with pytest.raises(ValueError, match="a Scene is not a mesh"):
+        MovingMesh(trimesh.Scene([mesh]))
     with pytest.raises(ValueError, match=r"a PointCloud is not a mesh, .* no faces"):
         flatten(trimesh.PointCloud(V))
 

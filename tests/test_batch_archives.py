@@ -17,8 +17,9 @@ import pytest
 
 from quasiharmonic import batch, io
 from quasiharmonic.ui.batch import places, records
-from quasiharmonic.ui.batch.readers import find_archives, read_samples
+from quasiharmonic.ui.batch.readers import find_archives
 from quasiharmonic.ui.batch.results import Result, read_about, read_results
+from quasiharmonic.ui.batch.samples import read_samples
 from quasiharmonic.ui.batch.tar_stream import Damage, read_members
 from quasiharmonic.ui.batch.writers import Journal
 from quasiharmonic.ui.cli import main
@@ -116,14 +117,18 @@ class TestSamples:
         for error, words in zip(errors[1:], ("no mesh", "used twice", "several meshes"), strict=True):
             assert words in error
 
-    def test_a_list_of_fixed_vertices_that_may_be_lost(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("extensions", "damaged", "errors"),
+        [(("obj", "txt"), 3, [False, True, True, False]), (("txt", "obj"), 4, [False, False, True, True])],
+    )
+    def test_a_list_of_fixed_vertices_that_may_be_lost(self, tmp_path, extensions, damaged, errors):
         """Without its list a problem would be another problem: its whole boundary would be fixed."""
-        files = [(f"{k}.{extension}", b"0") for k in range(3) for extension in ("obj", "txt")]
+        files = [(f"{k}.{extension}", b"0") for k in range(3) for extension in extensions]
         path = write_tar(tmp_path / "a.tar", files)
         data = bytearray(path.read_bytes())
-        data[3 * 1024 + 3] ^= 1  # the header of 1.txt
+        data[damaged * 1024 + 3] ^= 1  # the header of a list
         path.write_bytes(data)
-        assert [bool(one.error) for one in read_samples(path)] == [False, True, True, False]
+        assert [bool(one.error) for one in read_samples(path)] == errors
 
     def test_parquet(self, tmp_path):
         pyarrow = pytest.importorskip("pyarrow")
@@ -188,6 +193,17 @@ class TestJournal:
         found = [(key, record["problem"], data) for key, record, data, _ in read_results(tmp_path / name)]
         assert found == [("0", "0", b"v 0 0 0\n"), ("1", "1", None), ("2", "2", b"v 0 0 0\n")]
         assert os.listdir(tmp_path) == [name]
+
+
+    def test_a_copy_of_a_parquet_archive_that_was_killed_is_continued(self, tmp_path):
+        pytest.importorskip("pyarrow")
+        journal = Journal(tmp_path / "r.parquet")
+        for name in "abc":
+            journal.add(self.result(name, name.encode()))
+        data = journal.part.read_bytes()
+        journal.finish("abc", "stamp", "settings", "obj")
+        journal.part.write_bytes(data[: len(data) // 2])
+        assert sorted(Journal(tmp_path / "r.parquet").entries) == ["a", "b", "c"]
 
 
 class TestFinding:

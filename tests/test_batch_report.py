@@ -251,6 +251,13 @@ class TestAgainst:
         assert "60 problems in both runs; median 20 times faster" in text
         assert "against 3" in text
 
+    def test_times_of_zero_are_not_compared(self, tmp_path):
+        ours = made(tmp_path, 20)
+        rows = [f"{row['problem']},{row['seconds'] * 3 if k < 5 else 0}\n" for k, row in enumerate(ours)]
+        (tmp_path / "o.csv").write_text("problem,seconds\n" + "".join(rows))
+        text = Reader(written(tmp_path, tmp_path / "t.csv", tmp_path / "o.csv")).text
+        assert "5 problems in both runs; median 3 times faster" in text
+
     def test_nothing_in_common(self, tmp_path):
         made(tmp_path, 10)
         (tmp_path / "o.csv").write_text("problem,seconds\nz,1\n")

@@ -132,6 +132,7 @@ def _charts(result):
         ({"lightmap": True, "padding": 1}, "a padding of at least 4 texels, not 1"),
         ({"lightmap": True, "resolution": 8}, "6 charts .* do not fit into a lightmap of 8 × 8 texels: use 32 × 32"),
         ({"lightmap": True, "texels_per_unit": 90, "resolution": 64}, "do not fit into a lightmap of 64 × 64 texels"),
+        ({"lightmap": True, "texels_per_unit": 1e8, "resolution": 64}, "64 texels: reduce the padding or the texel"),
         ({"lightmap": 1}, "lightmap must be True or False"),
         ({"tile_by": "material"}, "needs materials: pass a file"),
         ({"tile_by": [0, 1]}, "tile_by must have shape \\(12,\\), one for each triangle"),

@@ -18,7 +18,7 @@ from quasiharmonic.io.fields import check_header
 from quasiharmonic.io.untrusted import check_gifti, parse_json, read_npy, resolve_beside, unpack_gzip, use_bound
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui.batch import records
-from quasiharmonic.ui.batch.readers import read_samples
+from quasiharmonic.ui.batch.samples import read_samples
 
 NESTED = b"[" * 100_000
 

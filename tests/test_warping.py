@@ -276,6 +276,11 @@ def test_the_plate_energy_has_the_stated_gradient():
         ({"curves": [([[1, 1], [np.nan, 2]], [[1, 1], [2, 2]])]}, "curve 0 is not finite at point 1"),
         ({"curves": [([[1, 1], [1, 1]], [[1, 1], [2, 2]])]}, "curve 0 has no length"),
         ({"curves": [([[1, 1], [5, 1]], [[1, 1], [2, 20]])]}, "curve 0, after: points .* not inside the image"),
+        (
+            {"curves": [([[1, 1], [4, 4]], [[1, 1], [4, 5]])]},
+            r"curve 0 moves its point \(4.0, 4.0\) to \(4.0, 5.0\), but",
+        ),
+        ({"curves": [([[1, 1], [2, 1]], [[1, 1], [2, 2]]), ([[3, 3], [2, 1]], [[3, 3], [2, 3]])]}, "curve 1 moves its"),
     ],
 )
 def test_invalid_landmark_options(options, message):

@@ -76,11 +76,26 @@ def make_landmarks(
         for name, points in ((f"curve {number}, before", one), (f"curve {number}, after", other)):
             _check_inside(name, points, ((points > 0) & (points < size)).all(axis=1), size)
         # A closed curve ends at its first point, and curves may share points.
-        new = ~(one[:, None] == before).all(axis=2).any(axis=1)
-        new[-1] &= len(one) < 2 or not np.array_equal(one[0], one[-1])
+        same = (one[:, None] == before).all(axis=2)
+        new = ~same.any(axis=1)
+        k, landmark = np.argwhere(same).T
+        _check_same_target(number, one[k], other[k], after[landmark], size)
+        new[-1] &= not np.array_equal(one[0], one[-1])
         before, after = np.concatenate([before, one[new]]), np.concatenate([after, other[new]])
         weight = np.concatenate([weight, np.full(np.count_nonzero(new), np.inf)])
     return Landmarks(before, after, weight)
+
+
+def _check_same_target(number: int, points: FloatArray, ends: FloatArray, given: FloatArray, size: IntArray) -> None:
+    """Raise ValueError if points (k, 2) of a curve, which are at other landmarks, have another target than these."""
+    rounding = 1e-9 * float(size.max())
+    different = np.flatnonzero(np.abs(ends - given).max(axis=1, initial=0.0) > rounding)
+    if different.size:
+        k = different[0]
+        raise ValueError(
+            f"curve {number} moves its point {tuple(points[k].tolist())} to {tuple(ends[k].tolist())}, but a landmark "
+            f"or another curve moves it to {tuple(given[k].tolist())}: give both the same target"
+        )
 
 
 def is_on_border(points: FloatArray, size: IntArray) -> BoolArray:
@@ -142,8 +157,8 @@ def _check_inside(name: str, points: FloatArray, inside: Any, size: IntArray) ->
     outside = np.flatnonzero(~inside)
     if outside.size:
         raise ValueError(
-            f"{name}: {names_of('point', 'points', outside)} not inside the image, 0 < x < {size[0]} to the right and "
-            f"0 < y < {size[1]} down: the first is at {tuple(points[outside[0]].tolist())}"
+            f"{name}: {names_of('point', 'points', outside)} not inside the image, of {size[0]} to the right and "
+            f"{size[1]} down: the first is at {tuple(points[outside[0]].tolist())}"
         )
 
 

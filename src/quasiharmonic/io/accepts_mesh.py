@@ -22,7 +22,7 @@ from quasiharmonic.io.objects import MeshLike, mesh_arrays, planar_arrays, stand
 from quasiharmonic.io.registry import FilePath, suffixes
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe, index_array, vertex_array
 
-# Number of nodes by kind of cell, in meshio's and VTK's names; then the kinds to skip, which have no area.
+# Kinds of cells in meshio's and VTK's names: number of nodes of planar ones, solids, and those without area.
 _NODES = {"triangle": 3, "quad": 4, "triangle6": 6, 5: 3, 9: 4, 22: 6}
 _TETRAHEDRA = ("tetra", 10)
 _SOLIDS = ("tetra10", "hexahedron", "wedge", "pyramid", "hexahedron20", "hexahedron27", 11, 12, 13, 14, 24, 25)
@@ -65,7 +65,7 @@ def simulation_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     if hasattr(given, "doflocs"):
         X = vertex_array(np.asarray(given.doflocs).T, f"doflocs of {what}", finite=False)
         return X, index_array(f"t of {what}", np.asarray(given.dofs.element_dofs).T)
-    if hasattr(given, "geometry"):
+    if hasattr(getattr(given, "geometry", None), "dofmap"):
         X = without_constant_z(vertex_array(given.geometry.x, f"geometry of {what}", finite=False))
         F = index_array(f"dofmap of {what}", given.geometry.dofmap)
         nodes = F.shape[1] if F.ndim == 2 else 0

@@ -236,8 +236,8 @@ def check_unfolded(wrong: BoolArray) -> None:
     """Raise ValueError for the cells in which a field without inverse folds."""
     if wrong.any():
         raise ValueError(
-            f"the field folds, so it has no inverse: at the cells whose first {_WORDS[wrong.ndim].many} are "
-            f"{name_points(wrong)}; use nearest_invertible (qhm field) to get the nearest invertible field"
+            f"the field folds, so it has no inverse: at the cells that begin at {name_points(wrong)}; "
+            "use nearest_invertible (qhm field) to get the nearest invertible field"
         )
 
 

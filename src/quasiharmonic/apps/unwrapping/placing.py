@@ -200,14 +200,12 @@ def _pack_texel_boxes(
             low, high, placed = (low, middle, placed) if found is None else (middle, high, found)
         scale = low
     if placed is None:
-        factor = 2
-        while _place(boxes.texels(scale), (factor * size[0], factor * size[1]), gap, rotate) is None:
-            factor *= 2
-            if factor * max(size) > MAX_SIZE:
-                break
+        larger = [(size[0] << k, size[1] << k) for k in range(1, 64) if max(size) << k <= MAX_SIZE]
+        enough = next((one for one in larger if _place(boxes.texels(scale), one, gap, rotate) is not None), None)
+        advice = "reduce the padding or the texel density" if enough is None else f"use {enough[0]} × {enough[1]}"
         raise ValueError(
             f"{count_of('chart', 'charts', len(charts))} with a padding of {padding:g} texels do not fit into a "
-            f"lightmap of {size[0]} × {size[1]} texels: use {factor * size[0]} × {factor * size[1]}"
+            f"lightmap of {size[0]} × {size[1]} texels: {advice}"
         )
     corners, turned = placed
     stretch, uvs, placements = boxes.stretch(scale), [], []

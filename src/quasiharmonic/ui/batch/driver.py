@@ -19,7 +19,8 @@ from quasiharmonic.ui.batch import places, records
 from quasiharmonic.ui.batch.dataset import DataSet, Stream, scratch_folder
 from quasiharmonic.ui.batch.pool import solve_in_processes, solve_on_cluster
 from quasiharmonic.ui.batch.problems import MARKER, group_small
-from quasiharmonic.ui.batch.readers import FolderReader, Scratch, find_archives, results_name
+from quasiharmonic.ui.batch.readers import FolderReader, Scratch, find_archives
+from quasiharmonic.ui.batch.samples import results_name
 from quasiharmonic.ui.batch.settings import NAMING_FILES, Orders, Settings
 from quasiharmonic.ui.batch.shards import (
     WHOLE,

@@ -17,8 +17,8 @@ from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.untrusted import parse_json
 from quasiharmonic.ui.batch import records
 from quasiharmonic.ui.batch.places import fetch, read_start
-from quasiharmonic.ui.batch.readers import KEYS, is_archive, is_parquet, results_name
 from quasiharmonic.ui.batch.records import Record, load_pyarrow
+from quasiharmonic.ui.batch.samples import KEYS, is_archive, is_parquet, results_name
 from quasiharmonic.ui.batch.tar_stream import (
     END_MARK,
     Damage,

@@ -18,7 +18,7 @@ from typing import BinaryIO, NamedTuple
 from quasiharmonic.io.atomic import writing
 from quasiharmonic.ui.batch import places, records
 from quasiharmonic.ui.batch.problems import ProblemFiles
-from quasiharmonic.ui.batch.readers import ArchiveReader, FolderReader, is_parquet, results_name
+from quasiharmonic.ui.batch.readers import ArchiveReader, FolderReader
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.results import (
     PART,
@@ -29,6 +29,7 @@ from quasiharmonic.ui.batch.results import (
     read_tar_results,
     write_results,
 )
+from quasiharmonic.ui.batch.samples import is_parquet, results_name
 from quasiharmonic.ui.batch.settings import Orders
 from quasiharmonic.ui.batch.supervisor import is_valid
 
@@ -54,7 +55,10 @@ class ResultWriter:
     """
 
     def find_finished(self) -> Counter[str] | None:
-        """Return the numbers of outcomes if all problems are known to be finished, before they are read; else None."""
+        """Return the numbers of outcomes if all problems are known to be finished, before they are read; else None.
+
+        Results may be moved to where they belong now, and what a killed run left may be deleted.
+        """
         return None
 
     def open(self) -> None:
@@ -262,13 +266,14 @@ class Journal:
         self._end = 0  # Offset after the last whole result
         with writing(self.part):
             path.parent.mkdir(parents=True, exist_ok=True)
-            if not self.part.exists() and path.exists():
-                if not is_parquet(path):
-                    os.replace(path, self.part)
-                else:
-                    for result in read_results(path):
-                        self.add(result)
+            if path.exists() and not is_parquet(path) and not self.part.exists():
+                os.replace(path, self.part)
             self._repair()
+            if path.exists() and is_parquet(path):
+                # An earlier run may have been killed while it copied some.
+                for result in read_results(path):
+                    if result.key not in self.entries and records.is_intact(result.record, result.data):
+                        self.add(result)
 
     def record(self, key: str) -> Record | None:
         """Return the kept values of the newest record of a problem; None if there is none."""

@@ -82,9 +82,11 @@ def _page(run: BatchRun, other: BatchRun | None) -> str:
         *([] if other is None else [_times(run)]),
         _phases(run),
         "</div>",
-        _gallery("Highest stretch, max(σ₁, 1/σ₂), of certified maps", draw, _find_worst(run, "isometric")),
-        _gallery("Highest MIPS distortion of certified maps", draw, _find_worst(run, "mips")),
-        _gallery("Slowest certified maps", draw, _find_worst(run, "seconds")),
+        _gallery(
+            "Highest stretch, max(σ₁, 1/σ₂), of certified maps", draw, _order_by(run, "isometric")[: _LIMITS.pictures]
+        ),
+        _gallery("Highest MIPS distortion of certified maps", draw, _order_by(run, "mips")[: _LIMITS.pictures]),
+        _gallery("Slowest certified maps", draw, _order_by(run, "seconds")[: _LIMITS.pictures]),
         _failures(run, draw),
     ]
     return _PAGE.substitute(title=title, style=STYLE, sections="\n".join(filter(None, sections)))
@@ -174,7 +176,8 @@ def _groups(run: BatchRun) -> str:
 
 def _describe_unwraps(run: BatchRun) -> str:
     """Return a table of the charts of unwrapped models, those with most charts first; empty for maps."""
-    rows = _find_worst(run, "charts", _LIMITS.listed)
+    certified = _order_by(run, "charts")
+    rows = certified[: _LIMITS.listed]
     if not rows:
         return ""
     lines = [
@@ -193,8 +196,8 @@ def _describe_unwraps(run: BatchRun) -> str:
         f"Medians: {count} charts, stretch {stretch}, {use} of the texture used. "
         f"{cleaned:,} of {len(run.rows):,} models were cleaned."
     )
-    if len(run.rows) > _LIMITS.listed:
-        words += f" The table of records lists more than these {_LIMITS.listed}."
+    if len(certified) > len(rows):
+        words += f" The table of records lists more than these {len(rows)}."
     head = "model", "charts", "seam length", "stretch of 99 %", "used texture", "cleaned"
     return f"<h2>Charts</h2><p>{words}</p>{_table(head, lines)}"
 
@@ -232,12 +235,13 @@ def _times(run: BatchRun) -> str:
 
 def _comparison(run: BatchRun, other: BatchRun) -> str:
     ours, theirs = statistics.match_column(run, other, "seconds")
+    timed = (ours > 0) & (theirs > 0)
+    ours, theirs = ours[timed], theirs[timed]
     name = escape_text(other.name)
     if not ours.size:
         words = f"No problem of {name} has a time and the name of a problem of this run."
         return f'<section class="card"><h2>Time against {name}</h2><p>{words}</p></section>'
-    with np.errstate(divide="ignore"):
-        ratio = quantile(theirs / ours, 0.5)
+    ratio = quantile(theirs / ours, 0.5)
     sentence = f"median {number(ratio)} times faster" if ratio >= 1 else f"median {number(1 / ratio)} times slower"
     return _figure(
         f"Time against {name}",
@@ -258,11 +262,11 @@ def _phases(run: BatchRun) -> str:
     return f'<section class="card"><h2>Time by phase</h2>{table}</section>'
 
 
-def _find_worst(run: BatchRun, column: str, most: int = _LIMITS.pictures) -> list[Record]:
-    """Return the certified records with the highest values in a column, in decreasing order."""
+def _order_by(run: BatchRun, column: str) -> list[Record]:
+    """Return the certified records with a value in a column, the highest first."""
     values = np.where(run.certified, run.column(column), np.nan)
     order = np.argsort(-values, kind="stable")
-    return [run.rows[k] for k in order[:most] if not np.isnan(values[k])]
+    return [run.rows[k] for k in order if not np.isnan(values[k])]
 
 
 def _gallery(title: str, draw: Draw, rows: Sequence[Record]) -> str:
