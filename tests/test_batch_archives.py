@@ -194,7 +194,6 @@ class TestJournal:
         assert found == [("0", "0", b"v 0 0 0\n"), ("1", "1", None), ("2", "2", b"v 0 0 0\n")]
         assert os.listdir(tmp_path) == [name]
 
-
     def test_a_copy_of_a_parquet_archive_that_was_killed_is_continued(self, tmp_path):
         pytest.importorskip("pyarrow")
         journal = Journal(tmp_path / "r.parquet")

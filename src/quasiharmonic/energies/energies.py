@@ -23,7 +23,7 @@ energy                in singular values   φ, with D = det J = a − b     pape
 ====================  ===================  ============================  ===========
 
 All energies are nonnegative and vanish at isometries; MIPS also vanishes at similarities. All but MIPS compare lengths
-or areas, so the map must first be scaled to the surface's area. `DeformationEnergy` does this.
+or areas, so the map must first be scaled to the surface's area. `DeformationEnergy` does this if it is given ``area``.
 
 To add an energy, derive from `Isotropic` (three short functions of a and b) or from `Energy`. Verify its derivatives
 with `quasiharmonic.energies.derivatives.check_energy`.
@@ -232,12 +232,12 @@ class Isotropic(Energy):
     def curvature(self, d: Deformation, *, negative: float = 0.0) -> QuadraticForm:
         """Second derivative of the density as a quadratic form in (dp, dq)."""
         slope_a, slope_b = self.density_gradient(d)
-        aa, ab, bb = self.density_hessian(d)
+        phi_aa, phi_ab, phi_bb = self.density_hessian(d)
         turn_p, turn_q = 2 * slope_a, 2 * slope_b
-        along_p, along_q = turn_p + 4 * d.a * aa, turn_q + 4 * d.b * bb
+        along_p, along_q = turn_p + 4 * d.a * phi_aa, turn_q + 4 * d.b * phi_bb
         turn_p, turn_q = damp(turn_p, negative), damp(turn_q, negative)
-        along_p, off_diagonal, along_q = _damp_matrices(along_p, 4 * np.sqrt(d.a * d.b) * ab, along_q, negative)
-        mixed = 4 * off_diagonal * ab
+        along_p, factor, along_q = _damp_matrices(along_p, 4 * np.sqrt(d.a * d.b) * phi_ab, along_q, negative)
+        mixed = 4 * factor * phi_ab
         # Where p or q vanishes, the two eigenvalues are equal, so its direction does not matter.
         to_p: ComplexArray = np.conj(d.p)
         to_q: ComplexArray = np.conj(d.q)

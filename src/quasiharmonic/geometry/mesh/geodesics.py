@@ -68,13 +68,13 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
     number = np.arange(3 * f)
     after, before = (number + f) % (3 * f), (number + 2 * f) % (3 * f)
     # The apex, in the frame where the half-edge leads from 0 to 1.
-    height = 1 + side[after] / side
+    summit = 1 + side[after] / side
     twin = _twins(tail, head, n)
 
     # Each window has its source at 0. Its half-edge leads from ``a`` to ``b`` counterclockwise around the source, on
     # the near side. The visible directions lie between ``low`` and ``high``.
     edge, source = number, apex
-    a, b = -height * side, (1 - height) * side
+    a, b = -summit * side, (1 - summit) * side
     low, high = a, b
     found = [(tail, head, np.abs(side)), (head, tail, np.abs(side))]
     for _ in range(crossings):
@@ -83,7 +83,7 @@ def straight_segments(V: FloatArray, F: IntArray, crossings: int, *, lowest: flo
         edge, source, a, b, low, high = edge[inner], source[inner], a[inner], b[inner], low[inner], high[inner]
         heartbeat()
         # Cross the edge. The triangle on the other side traverses it from ``b`` to ``a``.
-        c = b + height[edge] * (a - b)
+        c = b + summit[edge] * (a - b)
         left, right = _cross(low, c) > 0, _cross(c, high) > 0
         seen = left & right
         found.append((source[seen], apex[edge[seen]], np.abs(c[seen])))

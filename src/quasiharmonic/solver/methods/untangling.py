@@ -40,8 +40,9 @@ class UntanglingTuning(NamedTuple):
 
     # Weight λ of areas relative to angles.
     area_weight: float = 1e-4
-    # First ε, as a fraction of the absolute least determinant.
+    # First ε, as a fraction of the absolute least determinant, and its least value, for determinants near zero.
     first_epsilon: float = 0.2
+    least_first_epsilon: float = 1e-9
     # Maximum number of steps at each ε.
     steps: int = 20
     # Relative decrease of the energy below which ε is reduced.
@@ -177,7 +178,7 @@ def untangle(
     with np.errstate(all="ignore"):
         descent = RegularisedDescent(F, w, fixed, references, linear_solver, 1.0 if weights is None else weights)
     min_det = descent.min_det
-    descent.energy.epsilon = np.hypot(1e-9, _TUNING.first_epsilon * min_det)
+    descent.energy.epsilon = np.hypot(_TUNING.least_first_epsilon, _TUNING.first_epsilon * min_det)
     while not min_det > 0 and descent.energy.epsilon > _TUNING.min_epsilon * max(abs(min_det), _TUNING.min_determinant):
         before = descent.value()
         for _ in range(_TUNING.steps):
@@ -194,6 +195,8 @@ def untangle(
         min_det = descent.min_det
         if not np.isfinite(min_det):
             return
+        # The rule of Garanzha et al. with σ = 1/2: ε is halved if the least determinant is near zero, and falls by a
+        # quarter if it is far below −ε.
         root = np.hypot(min_det, descent.energy.epsilon)
         descent.energy.epsilon *= 1 - 0.5 * root / (abs(min_det) + root)
 
