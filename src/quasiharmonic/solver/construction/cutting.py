@@ -258,19 +258,24 @@ class Cutting:
         # The sheet has numbered new copies, on the right of the cut, in the order of the walk; the last one only if the
         # end was doubled, too. They have the same positions in the guide.
         self._guide += [self._guide[copy] for copy in path[: len(self.sheet.vertex) - len(self._guide)]]
-        # To the right of the cut, corners use the right copies: iterate clockwise around a and counterclockwise around
-        # b.
+        self._use_copies(a, b, right[0], right[-1] if right[-1] != end else None)
+
+    def _use_copies(self, a: int, b: int, at_a: int, at_b: int | None) -> None:
+        """Note the copies at the corners to the right of a cut from a to b; ``at_b`` is None if b was not doubled.
+
+        The corners at ``a`` follow clockwise, those at ``b`` counterclockwise, up to the next cut.
+        """
         apex = self.regions.apex
         head = apex[b, a]
-        self._copy_at[a, head] = right[0]
+        self._copy_at[a, head] = at_a
         while (a, head) not in self._closed and (head, a) in apex:
             head = apex[head, a]
-            self._copy_at[a, head] = right[0]
-        if right[-1] != end:
+            self._copy_at[a, head] = at_a
+        if at_b is not None:
             head = a
-            self._copy_at[b, head] = right[-1]
+            self._copy_at[b, head] = at_b
             while (b, (head := apex[b, head])) in apex and (b, head) not in self._closed:
-                self._copy_at[b, head] = right[-1]
+                self._copy_at[b, head] = at_b
 
     def _place_along(self, path: list[int], start: complex, end: complex) -> None:
         """Assign positions on the segment to the vertices of a walk: half by their current spacing, half evenly."""

@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import argparse
 import time
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import map_options, pipeline, process, report, written_map
 from quasiharmonic.ui.cli.arguments import (
@@ -32,6 +33,8 @@ from quasiharmonic.ui.cli.arguments import (
 from quasiharmonic.util.options import ENERGIES, DescentOptions, MapOptions
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -40,6 +43,7 @@ if TYPE_CHECKING:
     from quasiharmonic.io.seamed_mesh import Island
     from quasiharmonic.problem import Problem
     from quasiharmonic.problem.result import MapResult
+    from quasiharmonic.solver.search.stages import Stages
     from quasiharmonic.ui.cli.map_options import IslandProblem
     from quasiharmonic.ui.cli.written_map import WrittenMap
 
@@ -108,13 +112,7 @@ def _map(
     """Map a mesh, island by island."""
     from quasiharmonic import io
     from quasiharmonic.apps.atlas.mapped_atlas import each_island, merge_refined
-    from quasiharmonic.energies.polishing import smooth
-    from quasiharmonic.problem.result import Status
-    from quasiharmonic.problem.run import run_within
-    from quasiharmonic.solver.mapping import solve
-    from quasiharmonic.solver.refinement import on_refinement
     from quasiharmonic.solver.search.stages import select_strategy
-    from quasiharmonic.util.arrays import names_of
 
     strategy = select_strategy(options.strategy, **pick(options, *declare_options(DescentOptions)))
     fixed = None if fixed_path is None else io.read_handles(fixed_path, len(mesh.V))
@@ -126,26 +124,8 @@ def _map(
     posed: list[IslandProblem] = []
 
     def solve_island(island: Island) -> MapResult:
-        one = map_options.make_problem(options, island, fixed, len(posed))
-        posed.append(one)
-        problem = one.fitted.problem
-        given = pick(options, "polish", "linear_solver", *declare_options(MapOptions))
-        given["strategy"] = strategy
-        slide = one.slide if options.polish else False
-        with process.progress_line() as show:
-            result = solve(problem, slide=slide, callback=show, **given)
-        if result.status is Status.INTERRUPTED and not result.history:
-            raise KeyboardInterrupt
-        if not options.no_polish and options.polish is None and result.status is Status.INJECTIVE:
-            # The short default polish lowers the worst distortion at little cost.
-            fine = on_refinement(problem, result.refined)
-            given = {"linear_solver": options.linear_solver, "slide": one.slide}
-            left = None if options.time_limit is None else options.time_limit - result.seconds
-            if left is not None and left <= 0:
-                return result
-            with process.progress_line() as show:
-                return run_within(left, lambda: smooth(fine, result, callback=show, **given))
-        return result
+        posed.append(map_options.make_problem(options, island, fixed, len(posed)))
+        return _solve(options, posed[-1], strategy)
 
     with report.name_source(source):
         mapped = each_island(found.mesh, solve_island, reflect=options.to is None, only=options.islands)
@@ -161,35 +141,73 @@ def _map(
         certified = written_map.certify_map(written)
         if options.plot is not None:
             draw(options.plot, certified, posed[0].fitted.problem, mapped, options.kind)
-        added = sum(one.result.added for one in mapped.islands)
-        filled = sum(one.fitted.filled_holes for one in posed)
         facts = {
             **mapped.to_dict(),
             **certified.to_dict(),
             "vertices": len(new.V),
             "triangles": len(new.F),
-            "fixed": sum(len(one.fitted.problem.fixed) for one in posed),
-            **({} if options.to is None else {"to": options.to}),
-            **found.facts,
-            **({"filled_holes": filled} if filled else {}),
-            **({"slide": True} if options.slide else {}),
-            **({"added_vertices": added} if options.refine else {}),
+            **_list_facts(options, found.facts, posed, mapped),
             "seconds_in_all": time.perf_counter() - began,
         }
-        notes = [*found.notes, *dict.fromkeys(note for one in posed for note in one.notes)]
-        if added:
-            notes.append(f"split {added} {'edge' if added == 1 else 'edges'}: new vertices are at the end of the list")
-        notes += [
-            "double precision is insufficient next to the fixed "
-            + names_of("vertex", "vertices", island.vertices[one.result.crowded])
-            for island, one in zip(islands, mapped.islands, strict=False)
-            if one.result.crowded.size
-        ]
-        lines = [written_map.describe_maps(mapped, certified, options.output), *notes]
-        lines += written_map.describe_end(mapped, certified)
+        lines = [written_map.describe_maps(mapped, certified, options.output), *found.notes]
+        lines += [*_describe_problems(posed, mapped, islands), *written_map.describe_end(mapped, certified)]
         return pipeline.Account(facts, lines, certified.injective)
 
     return pipeline.Changed(new, describe)
+
+
+def _solve(options: argparse.Namespace, posed: IslandProblem, strategy: str | Stages) -> MapResult:
+    """Map an island and polish its map, as the options demand. KeyboardInterrupt if there is no map yet."""
+    from quasiharmonic.energies.polishing import smooth
+    from quasiharmonic.problem.result import Status
+    from quasiharmonic.problem.run import run_within
+    from quasiharmonic.solver.mapping import solve
+    from quasiharmonic.solver.refinement import on_refinement
+
+    problem = posed.fitted.problem
+    given = pick(options, "polish", "linear_solver", *declare_options(MapOptions)) | {"strategy": strategy}
+    with process.progress_line() as show:
+        result = solve(problem, slide=posed.slide if options.polish else False, callback=show, **given)
+    if result.status is Status.INTERRUPTED and not result.history:
+        raise KeyboardInterrupt
+    left = None if options.time_limit is None else options.time_limit - result.seconds
+    by_default = not options.no_polish and options.polish is None
+    if not by_default or result.status is not Status.INJECTIVE or (left is not None and left <= 0):
+        return result
+    # The short default polish lowers the worst distortion at little cost.
+    fine = on_refinement(problem, result.refined)
+    with process.progress_line() as show:
+        polish = partial(smooth, fine, result, callback=show, linear_solver=options.linear_solver, slide=posed.slide)
+        return run_within(left, polish)
+
+
+def _list_facts(
+    options: argparse.Namespace, facts: dict[str, Any], posed: list[IslandProblem], mapped: MappedAtlas
+) -> dict[str, Any]:
+    """Return what the report says about the problems, with ``facts`` about the surface."""
+    filled = sum(one.fitted.filled_holes for one in posed)
+    return {
+        "fixed": sum(len(one.fitted.problem.fixed) for one in posed),
+        **({} if options.to is None else {"to": options.to}),
+        **facts,
+        **({"filled_holes": filled} if filled else {}),
+        **({"slide": True} if options.slide else {}),
+        **({"added_vertices": sum(one.result.added for one in mapped.islands)} if options.refine else {}),
+    }
+
+
+def _describe_problems(posed: list[IslandProblem], mapped: MappedAtlas, islands: Sequence[Island]) -> list[str]:
+    """Return the notes on the problems, on added vertices, and on vertices where double precision is insufficient."""
+    from quasiharmonic.util.arrays import count_of, names_of
+
+    notes = list(dict.fromkeys(note for one in posed for note in one.notes))
+    if added := sum(one.result.added for one in mapped.islands):
+        notes.append(f"split {count_of('edge', 'edges', added)}: new vertices are at the end of the list")
+    for island, one in zip(islands, mapped.islands, strict=False):
+        if one.result.crowded.size:
+            crowded = names_of("vertex", "vertices", island.vertices[one.result.crowded])
+            notes.append(f"double precision is insufficient next to the fixed {crowded}")
+    return notes
 
 
 def draw(path: Path, certified: WrittenMap, problem: Problem, mapped: MappedAtlas, kind: str = "map") -> None:
