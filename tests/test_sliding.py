@@ -264,7 +264,7 @@ def test_first_and_second_derivatives_along_curves(straight, rng):
         slope = np.sum(gradient.real * d.real + gradient.imag * d.imag)
         assert (merit(h * d) - merit(-h * d)) / (2 * h) == pytest.approx(slope, rel=1e-4)
     # The exact second derivative, without the barrier's, for which the Gauss–Newton form is used.
-    system.curve_stiffness = model.frame(start).forces
+    system.curve_stiffness = model.frame(start).tangents.bending * unit
     system.assemble(energy.curvature_of(start.derivatives, negative=1.0))
     matrix = system.matrix()
     for _ in range(3):

@@ -69,27 +69,55 @@ class _Boundary(NamedTuple):
     energy: float
 
 
-class _TangentFrame(NamedTuple):
-    """First derivatives at a map, and the directions in which sliding vertices may move.
+class Tangents(NamedTuple):
+    """Directions in which sliding vertices may move along their curves in this step.
 
     Attributes
     ----------
-    gradient : (n - k,) complex128
-        Derivative by the unknowns; for a sliding vertex it is in the real part, and the imaginary part is zero.
     tangent : (k,) complex128
-        Unit tangents; zero for vertices that stay for this step.
-    forces : (k,) float64
-        Contribution of the curves' curvature to the second derivative, in units.
+        Unit tangents; zero for vertices that stay.
+    slope : (k,) float64
+        Derivative of the objective by the length along the tangent; zero for vertices that stay.
+    bending : (k,) float64
+        Contribution of the curves' curvature to the second derivative by this length.
     side : (k,) float64
         At kinks, the sign of the side to which the vertex may move; otherwise 0.
-    barrier_hessian : (e, 2, 2) float64
-        Second derivatives of the barrier by the ends of each edge.
+    """
+
+    tangent: ComplexArray
+    slope: FloatArray
+    bending: FloatArray
+    side: FloatArray
+
+
+def choose_tangents(track: Track, s: FloatArray, pull: ComplexArray, barrier: FloatArray) -> Tangents:
+    """Return the tangents at the arc lengths ``s`` (k,).
+
+    ``pull`` (k,) is the derivative of the energy by the positions of the sliding vertices, and ``barrier`` (k,) that of
+    other terms by the arc lengths.
+    """
+    kink = track.at_kink(s)
+    ahead, curvature = track.frame(s, np.ones(s.size, dtype=bool))
+    back, curvature_back = track.frame(s, ~kink)
+    slope, slope_back = (_component_along(tangent, pull) + barrier for tangent in (ahead, back))
+    # If the objective decreases to both sides, take the steeper one.
+    turned = kink & (slope_back > np.maximum(-slope, 0))
+    stays = kink & (slope >= 0) & (slope_back <= 0)
+    tangent = np.where(stays, 0, np.where(turned, back, ahead))
+    bending = _component_along(1j * tangent, pull) * np.where(turned, curvature_back, curvature)
+    # A vertex may leave a kink only to the chosen side.
+    side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
+    return Tangents(tangent, np.where(stays, 0, np.where(turned, slope_back, slope)), bending, side)
+
+
+class _TangentFrame(NamedTuple):
+    """First derivatives (n - k,) at a map by the unknowns, tangents, and second derivatives of the barrier (e, 2, 2).
+
+    The derivative by a sliding vertex is in the real part; the imaginary part is zero.
     """
 
     gradient: ComplexArray
-    tangent: ComplexArray
-    forces: FloatArray
-    side: FloatArray
+    tangents: Tangents
     barrier_hessian: FloatArray
 
 
@@ -219,52 +247,33 @@ class SlidingModel(MapModel):
     def gradient(self, state: NewtonState) -> ComplexArray:
         """See `MapModel`; also sets the unknowns of the sliding vertices for this step."""
         self._frame = self.frame(state)
-        self.system.tangent = self._frame.tangent
+        self.system.tangent = self._frame.tangents.tangent
         return self._frame.gradient
 
     def frame(self, state: NewtonState) -> _TangentFrame:
         """Derivatives at a state by the unknowns; see `_TangentFrame`."""
         s = state.extra.s
         pull = self.energy.gradient_of(state.derivatives, state.w.size)
-        at, system = pull[self._track.vertices], self.system
         barrier_gradient, barrier_hessian = self._barrier(s)
-        kink = self._track.at_kink(s)
-        ahead, curvature = self._track.frame(s, np.ones(at.size, dtype=bool))
-        back, curvature_back = self._track.frame(s, ~kink)
-        slope, slope_back = (
-            _component_along(ahead, at) + barrier_gradient,
-            _component_along(back, at) + barrier_gradient,
-        )
-        # If the energy decreases to both sides, take the steeper one.
-        turned = kink & (slope_back > np.maximum(-slope, 0))
-        stays = kink & (slope >= 0) & (slope_back <= 0)
-        tangent = np.where(stays, 0, np.where(turned, back, ahead))
-        forces = _component_along(1j * tangent, at) * np.where(turned, curvature_back, curvature)
-        # A vertex may leave a kink only to the chosen side.
-        side = np.where(kink, np.where(turned, -1.0, 1.0), 0.0)
-        gradient = pull[system.free]
-        gradient[system.at] = np.where(tangent == 0, 0, _component_along(tangent, at) + barrier_gradient)
-        return _TangentFrame(gradient, tangent, forces * 2.0**self.coordinates.exponent, side, barrier_hessian)
+        tangents = choose_tangents(self._track, s, pull[self._track.vertices], barrier_gradient)
+        gradient = pull[self.system.free]
+        gradient[self.system.at] = tangents.slope
+        return _TangentFrame(gradient, tangents, barrier_hessian)
 
     def _barrier(self, s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the barrier in units: first by the sliding vertices' lengths, second per edge (e, 2, 2)."""
         by_ends, by_both = self.deviation_barrier.derivatives(s)
         unit = self.weight * 2.0**self.coordinates.exponent
         barrier_gradient = np.zeros(s.size)
-        self._add_at_ends(barrier_gradient, unit * by_ends)
+        self.deviation_barrier.add_at_ends(barrier_gradient, unit * by_ends)
         return barrier_gradient, unit * 2.0**self.coordinates.exponent * by_both
-
-    def _add_at_ends(self, total: FloatArray, values: FloatArray) -> None:
-        """Add values (e, 2) at the ends of the barrier's edges to the total (k,) of each sliding vertex."""
-        for number, value in zip(self.deviation_barrier.pairs.T, values.T, strict=True):
-            np.add.at(total, number[number >= 0], value[number >= 0])
 
     def assemble(self, state: NewtonState, negative: float) -> None:
         """See `MapModel`."""
         system, frame = self.system, self._frame
         assert frame is not None
-        system.curve_stiffness = damp(frame.forces, negative)
-        self._add_at_ends(system.curve_stiffness, frame.barrier_hessian.diagonal(axis1=1, axis2=2))
+        system.curve_stiffness = damp(frame.tangents.bending * 2.0**self.coordinates.exponent, negative)
+        self.deviation_barrier.add_at_ends(system.curve_stiffness, frame.barrier_hessian.diagonal(axis1=1, axis2=2))
         both_move = (system.tangent[self.deviation_barrier.pairs[self._both]] != 0).all(axis=1)
         system.coupling = np.where(both_move, frame.barrier_hessian[self._both, 0, 1], 0)
         system.assemble(self.energy.curvature_of(state.derivatives, negative=negative))
@@ -275,7 +284,7 @@ class SlidingModel(MapModel):
         """Set the direction to zero at vertices at a kink if it leads to the other side of the kink."""
         assert self._frame is not None
         at = self.system.at
-        wrong = direction[at].real * self._frame.side < 0
+        wrong = direction[at].real * self._frame.tangents.side < 0
         if wrong.any():
             expected_decrease += float(np.sum((gradient[at] * direction[at]).real[wrong]))
             direction[at[wrong]] = 0

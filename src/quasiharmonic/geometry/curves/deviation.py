@@ -104,6 +104,11 @@ class DeviationBarrier:
         count = max(len(self.pairs), 1)
         return np.concatenate(gradients) / count, np.concatenate(hessians) / count
 
+    def add_at_ends(self, total: FloatArray, values: FloatArray) -> None:
+        """Add values (e, 2) at the ends of the edges to the total (k,) of each sliding vertex."""
+        for number, value in zip(self.pairs.T, values.T, strict=True):
+            np.add.at(total, number[number >= 0], value[number >= 0])
+
     def _shares(self, s: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
         """``m/M`` of the edges on each curve, with first and second derivatives by the lengths of the ends."""
         found, every = [], self._track.all_lengths(s)
