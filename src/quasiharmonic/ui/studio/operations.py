@@ -26,14 +26,14 @@ from quasiharmonic.io.objects import as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.targets import filled, outline_curves
+from quasiharmonic.targets import filled, nearest_on_boundary, outline_curves
 from quasiharmonic.targets.boundary.fitted_problems import find_corner_vertices, place_beside
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.ui.studio import recipes
 from quasiharmonic.ui.studio.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Script, Source, public
 from quasiharmonic.ui.studio.state import IslandState, SessionState
 from quasiharmonic.ui.studio.validation import Outline, RequestError
-from quasiharmonic.util.arrays import IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 Callback = Callable[[Step], object] | None
 # Options of the smoothing after a search.
@@ -109,6 +109,21 @@ def map_to_outline(
     return after
 
 
+def with_corner(state: SessionState, k: int, vertex: int, callback: Callback = None) -> SessionState:
+    """Assign the boundary vertex of island ``k`` nearest to ``vertex`` to the next corner of its outline.
+
+    RequestError if there is no outline; ValueError if the order of the corners differs from that of the vertices.
+    """
+    one = state.islands[k]
+    outline = require_outline(one)
+    near = int(nearest_on_boundary(one.island.V, one.island.F, one.island.V[vertex][None])[0])
+    before = tuple((v, c) for v, c in one.chosen if v != near)
+    if len(before) >= max(len(one.corners), 1):
+        before = ()
+    chosen = (*before, (near, len(before)))
+    return map_to_outline(replace(state, selected=(k,)), outline, chosen, callback)
+
+
 def map_in_place(
     state: SessionState, start: SeamedMesh, only: list[int] | None, callback: Callback = None, follows: bool = False
 ) -> SessionState:
@@ -125,6 +140,24 @@ def map_in_place(
         mapped, recipe = recipes.perform(atlas.polish, start, source, "again.obj", _SMOOTHING | fixed, only, callback)
     recipe = replace(recipe, anew=anew, dragged=start is not state.mesh)
     return _diagnose_selected(rebuild(state, mapped, recipe, keep=("pins", "corners")))
+
+
+def move_target(
+    state: SessionState, k: int, target: FloatArray, uv: FloatArray | None
+) -> tuple[SessionState, SeamedMesh]:
+    """Return the state with one island selected and its target moved to ``target`` (k, 2); and the mesh so moved.
+
+    ``uv`` (m, 2) is an injective map with this target, if there is one.
+    """
+    one = state.islands[k]
+    places = [island.uv for island in state.mesh.islands]
+    assert one.result is not None
+    assert one.fixed is not None
+    own = (one.result.uv if uv is None else uv).copy()
+    own[one.fixed] = target
+    places[k] = own * one.sign
+    moved = replace(state.with_island(k, one.with_target(target)), selected=(k,))
+    return moved, state.mesh.with_places(places)
 
 
 def _map(
@@ -192,9 +225,9 @@ def _sliding_curves(outline: Outline) -> Given:
 
 
 def flatten_islands(state: SessionState, callback: Callback = None) -> SessionState:
-    """Flatten the selected islands with free boundaries; all of them along new seams if the user drew some."""
-    if state.drawn is not None:
-        return _flatten_along(state, state.drawn, callback)
+    """Flatten the selected islands with free boundaries; all of them along the wanted seams if these changed."""
+    if state.wanted_seams is not None:
+        return _flatten_along(state, state.wanted_seams, callback)
     mesh, only = state.mesh, choose(state)
     pins = _list_pins(state, state.selected)
     source = find_source(state, with_map=only is not None or pins is not None)
@@ -272,7 +305,7 @@ def rebuild(state: SessionState, mapped: MappedAtlas, recipe: Recipe, keep: Coll
         if same:
             new = replace(new, **{name: getattr(before, name) for name in keep})
         islands.append(fix_where_it_is(new))
-    return replace(state, mesh=mapped.mesh, islands=tuple(islands), recipe=recipe, selected=selected, drawn=None)
+    return replace(state, mesh=mapped.mesh, islands=tuple(islands), recipe=recipe, selected=selected, wanted_seams=None)
 
 
 def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, keep: Collection[str] = ()) -> SessionState:
@@ -292,6 +325,14 @@ def fix_where_it_is(one: IslandState) -> IslandState:
     edge = np.unique(boundary_edges(one.island.F, len(one.island.vertices)))
     fixed = np.union1d(edge, np.array(one.pins, dtype=np.int64))
     return replace(one, fixed=fixed, target=one.result.uv[fixed])
+
+
+def pin_vertices(state: SessionState, k: int, pins: Sequence[int]) -> SessionState:
+    """Return a state with these pins of island ``k`` at their positions; the map stays the same."""
+    one = state.islands[k]
+    assert one.result is not None
+    held = fix_where_it_is(replace(one, pins=tuple(pins)))
+    return replace(state.with_island(k, held), selected=(k,))
 
 
 def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> Given | None:
@@ -322,32 +363,39 @@ def _record_cut(state: SessionState, source: Source, script: Script, mesh: Code)
     return script.let("mesh", mesh.cut(cuts))
 
 
-def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> SessionState:
-    """Flatten the whole surface, cut along the seams that the user drew, and where this is not enough."""
+def _flatten_along(state: SessionState, seams: IntArray, callback: Callback) -> SessionState:
+    """Flatten the whole surface, cut along seams (k, 2), and where this is not enough."""
     surface = state.sheet.surface
     source = Source(state.sheet.name, None) if state.sheet.is_file else make_start(SeamedMesh(surface.V, surface.F))
     polygons = _polygons(state, source)
     mesh = SeamedMesh(surface.V, surface.F)
-    if len(drawn):
-        mesh = cut_along(mesh, drawn, polygons=polygons)
+    if len(seams):
+        mesh = cut_along(mesh, seams, polygons=polygons)
     cut = not all(is_flattenable(island) for island in mesh.islands)
     if cut:
         mesh = cut_apart(mesh, polygons=polygons, disks_too=True)
     mapped = atlas.flatten(mesh, callback=callback)
-    saved = recipes.saved_rows(SEAMS, "seams", drawn)
+    saved = recipes.saved_rows(SEAMS, "seams", seams)
     script = Script()
     code = script.let("mesh", public(as_seamed_mesh)(source.name))
     code = script.let("mesh", public(SeamedMesh)(code.V, code.F))
-    if len(drawn):
+    if len(seams):
         code = script.let("mesh", code.cut(saved.code))
     if cut:
         code = _record_cut(state, source, script, code)
     script.let("mesh", public(atlas.flatten)(code).mesh)
-    words = {"seams": SEAMS if len(drawn) else "none", "cut": cut}
-    options = {"seams": replace(saved, words=words, texts=saved.texts if len(drawn) else {})}
+    words = {"seams": SEAMS if len(seams) else "none", "cut": cut}
+    options = {"seams": replace(saved, words=words, texts=saved.texts if len(seams) else {})}
     recipe = recipes.record_call("flatten", source, "flat.obj", options, script)
     after = rebuild(state, mapped, recipe)
-    return replace(after, from_file=False, selected=tuple(range(len(mapped.islands))))
+    return replace(after, from_file=False).select_all()
+
+
+def require_outline(one: IslandState) -> Outline:
+    """Return the outline of an island's boundary; RequestError if there is none."""
+    if one.outline is None:
+        raise RequestError("corners need an outline: choose one under Boundary first")
+    return one.outline
 
 
 def require_map(state: SessionState) -> None:
