@@ -122,6 +122,7 @@ def drag_weights(
     others = np.flatnonzero(np.isin(loop, [c for c in corners if c != vertex]))
     is_corner = vertex in corners
     for way, last in ((ahead, others[:1]), (loop_length - ahead, others[-1:])):
+        # On a side without end, a corner moves a quarter of the loop in each direction.
         end = float(way[last[0]]) if last.size else (0.25 if is_corner else 1.0) * loop_length
         if not is_corner:
             end = min(end, REACH * loop_length)

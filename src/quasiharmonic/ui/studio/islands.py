@@ -33,12 +33,7 @@ def pack_all(state: SessionState, resolution: int, padding: float) -> SessionSta
 
 
 def move_islands(
-    state: SessionState,
-    by: FloatArray,
-    turn: float = 0.0,
-    scale: float = 1.0,
-    mirror: bool = False,
-    texels: int | None = None,
+    state: SessionState, by: FloatArray, turn: float, scale: float, mirror: bool, texels: int | None
 ) -> SessionState:
     """Move the selected islands together by a vector (2,).
 

@@ -218,11 +218,12 @@ def map_message(
     If an island is dragged, the message has only the positions of this island.
     """
     certificates = [one.result.certificate for one in state.islands if one.result is not None]
-    uv = places = state.uv.copy()
+    uv = places = state.uv
     if dragged is None:
         header = _describe_certificates(certificates, len(state.overlapping))
     else:
         k, shown = dragged
+        uv = uv.copy()
         start, places = int(state.numbering.starts[k]), shown.uv * state.islands[k].sign
         uv[start : start + len(places)] = places
         certificates[k] = shown.certificate

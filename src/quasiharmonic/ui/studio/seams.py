@@ -24,12 +24,10 @@ def find_seams(state: SessionState) -> IntArray:
     return state.mesh.seams if state.wanted_seams is None else state.wanted_seams
 
 
-def draw_seam(
-    state: SessionState, start: int, end: int, axis: str | None = None, *, forbid: bool = False
-) -> SessionState:
-    """Return the state in which the shortest path between two vertices, with its mirror images, is a wanted seam.
+def draw_seam(state: SessionState, start: int, end: int, axis: str | None, *, forbid: bool) -> SessionState:
+    """Return the state in which the shortest path between two vertices, with its mirror image, is a wanted seam.
 
-    With ``forbid``, the path must not become a seam instead. Vertices are those of the surface.
+    With ``forbid``, its edges are those that must not become seams. Vertices are those of the surface.
     """
     V, F = state.mesh.V, state.mesh.F
     path = add_mirrored(shortest_path(V, F, start, end), V, F, axis)
@@ -39,7 +37,7 @@ def draw_seam(
     return replace(state, wanted_seams=add_edges(find_seams(state), path), forbidden=forbidden)
 
 
-def erase_seam(state: SessionState, vertex: int, axis: str | None = None) -> SessionState:
+def erase_seam(state: SessionState, vertex: int, axis: str | None) -> SessionState:
     """Return the state without the chain nearest to a vertex, of seams or of edges that must not become seams."""
     V, F, seams = state.mesh.V, state.mesh.F, find_seams(state)
     chain = add_mirrored(find_chain(add_edges(seams, state.forbidden), V, vertex), V, F, axis)

@@ -56,12 +56,12 @@ class Operation:
     """
 
     busy: str = ""  # What the page shows during the computation; empty if it takes no time
-    requires: Callable[[SessionState], None] | None = (
-        None  # Raises RequestError unless the selected islands are suitable
-    )
-    of_all: bool = False  # Whether all islands must be suitable, not only the selected ones
+    requires: Callable[[SessionState], None] | None = None  # Check of the selected islands, by RequestError
+    of_all: bool = False  # Whether the check concerns all islands, not only the selected ones
     changed_seams: bool = False  # Whether it keeps the seams that the user changed, or cuts along them
-    ahead: bool = False  # Whether the page shows the result before, so that each error must restore the view
+    ahead: bool = (
+        False  # Whether the page has already moved the map, so that step 3 comes first: any error moves it back
+    )
     fit: bool = False  # Whether the page then shows the whole map
 
     def __call__(self, plan: Planner) -> Callable[[Session, MessageFrame], None]:
@@ -181,13 +181,9 @@ class Session(PageUpdates):
 
     @Operation(changed_seams=True)
     def _do_seam(self, frame: MessageFrame) -> Plan:
-        state, start, end = (
-            self.state,
-            self._find_model_vertex(frame, "start"),
-            self._find_model_vertex(frame, "vertex"),
-        )
+        start, end = self._find_model_vertex(frame, "start"), self._find_model_vertex(frame, "vertex")
         axis, forbid = _read_symmetry(frame), frame.header.get("forbid") is True
-        return None if start == end else lambda: draw_seam(state, start, end, axis, forbid=forbid)
+        return None if start == end else lambda: draw_seam(self.state, start, end, axis, forbid=forbid)
 
     @Operation(changed_seams=True)
     def _do_erase(self, frame: MessageFrame) -> Plan:

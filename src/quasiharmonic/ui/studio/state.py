@@ -72,10 +72,11 @@ class SessionState:
 
     @property
     def uv(self) -> FloatArray:
-        """The map of all islands (n, 2), in the numbering of the page; NaN for islands without a map."""
-        return np.concatenate(
-            [one.island.uv if one.result is None else one.result.uv * one.sign for one in self.islands]
-        )
+        """The map of all islands (n, 2), in the numbering of the page; NaN for islands without a map.
+
+        It is not stored, because the history has many states.
+        """
+        return np.concatenate([one.island.uv for one in self.islands])
 
     @cached_property
     def signs(self) -> FloatArray:
@@ -122,6 +123,10 @@ class SessionState:
     def __getstate__(self) -> dict[str, Any]:
         """Return the contents for a snapshot; what can be computed again is left out."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
+
+    def __setstate__(self, contents: dict[str, Any]) -> None:
+        """Take the contents of a snapshot; in older ones `wanted_seams` has the name ``drawn``."""
+        vars(self).update({"wanted_seams" if name == "drawn" else name: value for name, value in contents.items()})
 
 
 @dataclass(eq=False)

@@ -30,12 +30,7 @@ _MODEL = Code("model")
 
 
 def unwrap_model(
-    state: SessionState,
-    callback: Callback = None,
-    *,
-    keep_seams: bool = False,
-    selected: bool = False,
-    **given: Any,
+    state: SessionState, callback: Callback = None, *, keep_seams: bool = False, selected: bool = False, **given: Any
 ) -> SessionState:
     """Unwrap the model with options of `unwrap`; seams that the user changed become seams of the map.
 

@@ -36,8 +36,8 @@ Tell = Callable[[Mapping[str, Any], Mapping[str, Array]], None]
 class DragState:
     """State of a drag."""
 
-    island: int
-    place: FloatArray  # (2,): position where the drag started
+    island: int  # The island of the dragged vertex
+    place: FloatArray  # (2,): target position of that vertex when the drag started
     share: FloatArray  # (k,): share of the motion for each fixed vertex
     follower: Follower | None  # Computes the maps, if the drag starts from an injective map
     goal: FloatArray | None = None  # (k, 2): current target positions of the fixed vertices
@@ -66,8 +66,8 @@ class PageUpdates:
         # because its positions in single precision are exact only near it.
         self._numbering: Numbering | None = None
         self._origin = np.zeros(2)
-        # The last drag step whose motion the state contains. Each map has it as ``after``, so that the page knows
-        # whether its pointer is ahead of the map; -1 for none.
+        # Number of the last drag step that was handled, -1 for none. Each map has it as ``after``, so that the page knows
+        # whether the map includes the whole drag.
         self._after = -1
         # Whether the page was told that a computation runs. If it then fails, the page must be sent the state again.
         self._working = False

@@ -48,7 +48,7 @@ RESOLUTION = 2048
 PACKING_RESOLUTION = 1024
 #: Texels between islands: the default of both.
 PADDING = 4.0
-# Graphics cards have no larger textures.
+# The largest side of a texture that most graphics cards accept.
 _LARGEST_TEXTURE = 16_384
 # The maximum in the page's field, in texels.
 _LARGEST_PADDING = 64
