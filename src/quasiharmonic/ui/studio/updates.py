@@ -66,7 +66,7 @@ class PageUpdates:
         # because its positions in single precision are exact only near it.
         self._numbering: Numbering | None = None
         self._origin = np.zeros(2)
-        # Number of the last drag step that was handled, -1 for none. Each map has it as ``after``, so that the page knows
+        # Number of the last drag step that was handled, -1 for none. Each map has it as ``after``, which tells the page
         # whether the map includes the whole drag.
         self._after = -1
         # Whether the page was told that a computation runs. If it then fails, the page must be sent the state again.
