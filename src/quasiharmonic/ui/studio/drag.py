@@ -52,7 +52,7 @@ class Follower:
         self._operator = Objective(problem).of_map(problem.frame.inward(uv)).operator
         self._base = uv
 
-    def to(self, target: FloatArray, waiting: Callable[[], bool] = lambda: False) -> DragMap:
+    def move_to(self, target: FloatArray, waiting: Callable[[], bool] = lambda: False) -> DragMap:
         """Move the boundary to ``target`` (k, 2), or as far as possible within `PATIENCE`.
 
         ``waiting`` returns whether a newer target exists, so that this map is not needed.

@@ -10,7 +10,7 @@ from quasiharmonic.apps.atlas import island_functions as atlas
 from quasiharmonic.apps.atlas.atlas_verdict import MIRROR
 from quasiharmonic.geometry.mesh.topology import label_components
 from quasiharmonic.ui.studio import recipes
-from quasiharmonic.ui.studio.operations import as_it_is, find_source, saved_start
+from quasiharmonic.ui.studio.operations import find_source, rebuild_from_mesh, record_start
 from quasiharmonic.ui.studio.recipes import public
 from quasiharmonic.ui.studio.seams import find_chain, pair_sides
 from quasiharmonic.ui.studio.state import SessionState
@@ -29,7 +29,7 @@ def pack_all(state: SessionState, resolution: int, padding: float) -> SessionSta
     flat = script.let("flat", public(atlas.flatten)(source.name, start=True, max_iterations=0).mesh)
     script.let("mesh", public(atlas.pack)(flat, **size))
     recipe = recipes.record_call("flatten", source, "packed.obj", size, script, words=words)
-    return as_it_is(state, mesh, recipe, keep=("pins",))
+    return rebuild_from_mesh(state, mesh, recipe, keep=("pins",))
 
 
 def move_islands(
@@ -54,7 +54,7 @@ def move_islands(
             low = places[k].min(axis=0)
             places[k] = places[k] - low + np.rint(low * texels) / texels
     mesh = state.mesh.with_places(places)
-    return as_it_is(state, mesh, saved_start(mesh), keep=("pins",))
+    return rebuild_from_mesh(state, mesh, record_start(mesh), keep=("pins",))
 
 
 def stitch_seam(state: SessionState, vertex: int) -> SessionState:
@@ -100,7 +100,7 @@ def _join(state: SessionState, places: FloatArray, pairs: IntArray) -> SessionSt
     joined = count[label] > 1
     places[joined] = (middle[label] / count[label][:, None])[joined]
     mesh = state.mesh.with_places(np.split(places, state.numbering.starts[1:-1]))
-    after = as_it_is(state, mesh, saved_start(mesh))
+    after = rebuild_from_mesh(state, mesh, record_start(mesh))
     if state.injective and not after.injective:
         bad = sum(len(one.result.certificate.inverted) for one in after.islands if one.result is not None)
         raise RequestError(f"joined there, {bad} triangles would be inverted: erase the seam and press Unwrap")

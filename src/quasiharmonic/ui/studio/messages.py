@@ -49,7 +49,7 @@ class DistortionMonitor:
         self._when, self._cost = -np.inf, 0.0
         self._numbers: dict[str, Any] = {}
 
-    def look(self, uv: FloatArray, reflected: FloatArray, *, now: bool) -> dict[str, Any]:
+    def measure(self, uv: FloatArray, reflected: FloatArray, *, now: bool) -> dict[str, Any]:
         """Return energy, worst stretch, used space and scale of a map; recent values unless ``now`` is True.
 
         ``reflected`` is the map with mirrored islands reflected.

@@ -155,7 +155,7 @@ class Session(PageUpdates):
 
     def _keep_best(self, end: operations.Interrupted) -> None:
         """After Stop, keep the map that an interrupted step had, if it is injective."""
-        best = operations.as_it_is(self.state, end.mesh, operations.saved_start(end.mesh), keep=("pins",))
+        best = operations.rebuild_from_mesh(self.state, end.mesh, operations.record_start(end.mesh), keep=("pins",))
         if self._stopped and best.injective:
             self._keep(best)
         else:
@@ -229,7 +229,7 @@ class Session(PageUpdates):
     @Operation("finding the map")
     def _do_corner(self, frame: MessageFrame) -> Plan:
         k, vertex = self._find(frame)
-        return lambda: operations.with_corner(self.state, k, vertex, self._step)
+        return lambda: operations.assign_corner(self.state, k, vertex, self._step)
 
     @Operation("flattening", changed_seams=True, fit=True)
     def _do_flatten(self, frame: MessageFrame) -> Plan:
@@ -323,7 +323,7 @@ class Session(PageUpdates):
         drag.goal = one.target + drag.share[:, None] * (to * one.sign - drag.place)
         if drag.follower is None:
             return self._tell_map({}, seq=seq, asked=drag.goal)
-        drag.shown = shown = drag.follower.to(drag.goal, self._waiting)
+        drag.shown = shown = drag.follower.move_to(drag.goal, self._waiting)
         asked = None if shown.reached else drag.goal
         fields = {"state": "following", "reached": shown.reached}
         self._tell_map(fields, seq=seq, shown=shown, asked=asked)
@@ -340,13 +340,13 @@ class Session(PageUpdates):
         def compute() -> SessionState:
             state, start = operations.move_target(self.state, drag.island, goal, uv)
             try:
-                only = operations.choose(state)
+                only = operations.list_selected(state)
                 return operations.map_in_place(state, start, only, self._step, follows=uv is not None)
             except KeyboardInterrupt:
                 # The next message came before the final map. If the drag has a map, it is kept.
                 if uv is None:
                     raise
-                return operations.as_it_is(state, start, operations.saved_start(start), ("pins",))
+                return operations.rebuild_from_mesh(state, start, operations.record_start(start), ("pins",))
 
         return compute
 

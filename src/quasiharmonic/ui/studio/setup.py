@@ -11,12 +11,12 @@ import numpy as np
 
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.ui.studio.operations import (
-    as_it_is,
     flatten_islands,
     is_flattenable,
     map_in_place,
     map_to_outline,
-    saved_start,
+    rebuild_from_mesh,
+    record_start,
 )
 from quasiharmonic.ui.studio.recipes import Recipe
 from quasiharmonic.ui.studio.state import IslandState, SessionState
@@ -67,9 +67,9 @@ def _take_map(sheet: PageSurface, callback: Callable[[Any], object] | None) -> S
     """Return the state with the map of the file; of a problem, with a map that has its fixed vertices in place."""
     mesh = sheet.initial_map()
     pins = [] if sheet.fixed is None else sheet.fixed.tolist()
-    islands = tuple(_with_file_pins(IslandState(island), pins) for island in mesh.islands)
+    islands = tuple(_add_file_pins(IslandState(island), pins) for island in mesh.islands)
     state = SessionState(sheet, mesh, islands, Recipe()).select_all()
-    found = as_it_is(state, mesh, Recipe(), keep=("pins",))
+    found = rebuild_from_mesh(state, mesh, Recipe(), keep=("pins",))
     if not sheet.posed:
         return found
     try:
@@ -78,7 +78,7 @@ def _take_map(sheet: PageSurface, callback: Callable[[Any], object] | None) -> S
         return found
 
 
-def _with_file_pins(one: IslandState, pins: Sequence[int]) -> IslandState:
+def _add_file_pins(one: IslandState, pins: Sequence[int]) -> IslandState:
     """Return an island with those of its interior vertices pinned that are in a list of the surface's vertices."""
     if not pins:
         return one
@@ -95,4 +95,4 @@ def turn_over(state: SessionState) -> SessionState:
     middle = float(mesh.uv[:, 0].max()) + float(mesh.uv[:, 0].min())
     uv = np.stack([middle - mesh.uv[:, 0], mesh.uv[:, 1]], axis=1)
     turned = SeamedMesh(sheet.surface.V, sheet.surface.F, mesh.FT[:, (0, 2, 1)], uv)
-    return as_it_is(replace(state, sheet=sheet, from_file=False), turned, saved_start(turned))
+    return rebuild_from_mesh(replace(state, sheet=sheet, from_file=False), turned, record_start(turned))

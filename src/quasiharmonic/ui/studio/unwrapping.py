@@ -15,7 +15,7 @@ from quasiharmonic.geometry.mesh.topology import are_sides
 from quasiharmonic.io import read_mesh
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.ui.studio import recipes
-from quasiharmonic.ui.studio.operations import as_it_is, make_start, saved_start
+from quasiharmonic.ui.studio.operations import make_start, rebuild_from_mesh, record_start
 from quasiharmonic.ui.studio.recipes import FACES, FORBIDDEN, SEAMS, Code, Given, Recipe, Script, Source, public
 from quasiharmonic.ui.studio.state import SessionState
 from quasiharmonic.ui.studio.surface import PageSurface
@@ -64,8 +64,8 @@ def unwrap_model(
     mapped = SeamedMesh(sheet.surface.V, sheet.surface.F, FT, result.uvs)
     # A call that was stopped cannot be repeated.
     stopped = result.status is UnwrapStatus.TIME_LIMIT
-    recipe = saved_start(mapped) if stopped else _record_unwrap(source, options)
-    return replace(as_it_is(state, mapped, recipe), from_file=False).select_all()
+    recipe = record_start(mapped) if stopped else _record_unwrap(source, options)
+    return replace(rebuild_from_mesh(state, mapped, recipe), from_file=False).select_all()
 
 
 def _keep_parts(state: SessionState, keep_seams: bool, selected: bool) -> dict[str, Given]:
@@ -119,7 +119,7 @@ def _unwrap_rest(state: SessionState, callback: Callback, options: dict[str, Any
     right = np.ceil(uv[np.delete(FT, sheet.unmapped, axis=0), 0].max())
     FT[sheet.unmapped] = result.indices + len(uv)
     mapped = SeamedMesh(surface.V, surface.F, FT, np.concatenate([uv, result.uvs + np.array([right, 0.0])]))
-    return replace(as_it_is(state, mapped, saved_start(mapped)), from_file=False).select_all()
+    return replace(rebuild_from_mesh(state, mapped, record_start(mapped)), from_file=False).select_all()
 
 
 def _label_triangles(sheet: PageSurface, which: str) -> IntArray:

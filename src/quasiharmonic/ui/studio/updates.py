@@ -109,7 +109,7 @@ class PageUpdates:
 
     def _send_surface(self, state: SessionState) -> None:
         self._numbering = state.numbering
-        self._measured = DistortionMonitor(state.numbering.V, state.numbering.F)
+        self._monitor = DistortionMonitor(state.numbering.V, state.numbering.F)
         self._tell(*surface_message(state))
 
     def _send_image(self) -> None:
@@ -157,7 +157,7 @@ class PageUpdates:
         if everything or shown is not None:
             dragged = None if shown is None or drag is None else (drag.island, shown)
             more, arrays, uv = map_message(state, self._origin, dragged)
-            header |= more | self._measured.look(uv, uv * state.signs, now=seq < 0)
+            header |= more | self._monitor.measure(uv, uv * state.signs, now=seq < 0)
         targets = {} if asked is None or drag is None else {drag.island: asked}
         if targets or (everything and not state.in_place):
             arrays["asked"] = find_asked_boundary(state, targets, self._origin)

@@ -23,14 +23,14 @@ import numpy as np
 from quasiharmonic.apps.unwrapping.model_files import PARTS
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.targets import outline, outline_curves, read_svg
-from quasiharmonic.ui.studio.page import NAMES
+from quasiharmonic.ui.studio.page import OPTION_NAMES
 from quasiharmonic.ui.studio.protocol import MessageFrame
 from quasiharmonic.util.arrays import FloatArray
 from quasiharmonic.util.options import UnwrapOptions
 
 # A decimal number of limited length.
 _NUMBER = r"\d{1,6}(?:\.\d{1,6})?"
-_WORDS = re.compile(
+_SHAPES = re.compile(
     rf"disk|ellipse:{_NUMBER}x{_NUMBER}|ring:{_NUMBER}|rect:{_NUMBER}x{_NUMBER}|polygon:\d{{1,4}}|star:\d{{1,4}}"
     r"|letter:\S|word:\S{1,20}"
 )
@@ -129,8 +129,8 @@ def read_indices(frame: MessageFrame, name: str, n: int) -> list[int]:
 def read_options(frame: MessageFrame) -> dict[str, Any]:
     """Return the options of `unwrap`; ValueError or TypeError for invalid ones."""
     given = frame.header.get("options", {})
-    if not isinstance(given, dict) or not set(given) <= set(NAMES):
-        raise RequestError(f"options of unwrap are {', '.join(NAMES)}")
+    if not isinstance(given, dict) or not set(given) <= set(OPTION_NAMES):
+        raise RequestError(f"options of unwrap are {', '.join(OPTION_NAMES)}")
     if given.get("labels", "groups") not in PARTS:
         raise RequestError(f"labels are {' or '.join(PARTS)}")
     if given.get("symmetry") == "none":
@@ -179,7 +179,7 @@ class Outline:
 
 def make_outline(word: object) -> Outline:
     """Return the outline of a named shape, such as ``letter:R``; ValueError for other names, also those of files."""
-    if not isinstance(word, str) or not _WORDS.fullmatch(word):
+    if not isinstance(word, str) or not _SHAPES.fullmatch(word):
         raise ValueError(
             f"unknown outline {str(word)[:40]!r}: use disk, ellipse:2x1, ring:0.5, rect:2x1, polygon:6, star:5, "
             "letter:R and word:QH"
