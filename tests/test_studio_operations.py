@@ -73,6 +73,7 @@ def test_a_new_state_ends_a_drag():
     assert one.session.state is before
 
 
+@pytest.mark.slow
 def test_stop_keeps_a_map_that_is_found_at_the_end_of_a_drag():
     """The drag starts without a map, so only the search at its end finds one."""
     made = list[Visitor]()
@@ -129,6 +130,7 @@ def test_the_kind_of_an_obstruction_decides_what_a_drag_did(place, says, reworde
         assert again["message"] == shown["message"]
 
 
+@pytest.mark.slow
 def test_messages_and_operations_do_not_write_into_the_map(monkeypatch):
     """They get the same array at each access, which cannot be written."""
     compute, made = SessionState.uv.fget, {}

@@ -129,7 +129,7 @@ class Session(PageUpdates):
             self._drag_state = None
             if self._history and (self._working or not isinstance(error, RequestError)):
                 self._show()
-            # The surface of another model hides what was said before.
+            # Sent after the state, because the page removes its notes when it gets another surface.
             known = isinstance(error, ValueError | OSError | ArithmeticError | RuntimeError | ImportError)
             text = str(error) if known else f"unexpected {type(error).__name__}: {error}"
             self._tell({"kind": "note", "level": "error", "text": text}, {})
@@ -155,11 +155,11 @@ class Session(PageUpdates):
 
     def _keep_best(self, end: operations.Interrupted) -> None:
         """After Stop, keep the map that an interrupted step had, if it is injective."""
-        best = operations.rebuild_from_mesh(self.state, end.mesh, operations.record_start(end.mesh), keep=("pins",))
-        if self._stopped and best.injective:
-            self._keep(best)
-        else:
-            self._show()
+        if self._stopped:
+            best = operations.rebuild_from_mesh(self.state, end.mesh, operations.record_start(end.mesh), keep=("pins",))
+            if best.injective:
+                return self._keep(best)
+        self._show()
 
     # --- models, selection and seams ---------------------------------------------------------------------------------
 
