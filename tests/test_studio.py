@@ -58,7 +58,7 @@ def test_an_updated_map_is_the_harmonic_map_of_the_last_tensors():
     one = Visitor().session.state
     problem, uv = one.problem, one.result.uv
     target = problem.target * (1.2, 0.9) + 0.1 * problem.target[:, ::-1]
-    followed = Follower(problem, uv, one.result.certificate).to(target)
+    followed = Follower(problem, uv, one.result.certificate).move_to(target)
     mesh = problem.domain.mesh("equilateral")
     d = mesh.derivatives(problem.frame.inward(uv))
     expected = quasi_harmonic_map(problem.with_target(target), d.q / d.p)

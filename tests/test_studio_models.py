@@ -14,6 +14,7 @@ from quasiharmonic.surfaces import annulus, cat, grid, starfish
 from quasiharmonic.ui.studio import setup
 from quasiharmonic.ui.studio.setup import make_first_state
 from quasiharmonic.ui.studio.surface import MAX_TRIANGLES, make_sheet
+from quasiharmonic.ui.studio.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.validation import RequestError
 from shared.pages import Visitor
 
@@ -132,7 +133,7 @@ def test_seams_are_drawn_along_the_shortest_path_and_erased():
     V = one.session.state.numbering.V
     start, end = int(np.argmin(V[:, 0])), int(np.argmax(V[:, 0]))
     one.does("seam", start=start, vertex=end)
-    drawn = one.session.state.drawn
+    drawn = one.session.state.wanted_seams
     length = np.linalg.norm(V[drawn[:, 0]] - V[drawn[:, 1]], axis=1).sum()
     assert np.linalg.norm(V[start] - V[end]) <= length < 1.5 * np.linalg.norm(V[start] - V[end])
     assert one.last("map").header["drawn"]
@@ -205,13 +206,13 @@ def test_the_rest_of_a_map_is_unwrapped_like_a_whole_model(visitor):
     assert [len(face) for face in faces] == [5] * len(Q)
     state = setup.open_without_map(visitor.session.state.sheet)
     meridian = np.stack([12 + 24 * np.arange(12), 36 + 24 * np.arange(12)], axis=1)
-    drawn = replace(state, drawn=meridian)
+    drawn = replace(state, wanted_seams=meridian)
     for plan, options in ((drawn, {}), (state, {"labels": "groups"})):
-        seams = setup.unwrap_model(plan, **options).mesh.seams
+        seams = unwrap_model(plan, **options).mesh.seams
         wanted = meridian if plan is drawn else np.stack([144 + np.arange(24), 144 + np.arange(1, 25) % 24], axis=1)
         assert are_sides(np.sort(wanted), np.pad(np.sort(seams), [(0, 0), (0, 1)], mode="edge"), len(V)).all()
     with pytest.raises(RequestError, match="the file has no materials"):
-        setup.unwrap_model(state, labels="materials")
+        unwrap_model(state, labels="materials")
 
 
 def test_names_of_drawings_are_no_options(visitor):

@@ -204,7 +204,7 @@ class Stuck:
 
 @pytest.fixture
 def stuck(monkeypatch):
-    monkeypatch.setattr(served, "Page", Stuck)
+    monkeypatch.setattr(served, "PageProcess", Stuck)
     monkeypatch.setattr(served, "MAX_BYTES", 32 << 20)
     Stuck.started, Stuck.begins, Stuck.ends = 0, asyncio.Event(), asyncio.Event()
     with Running("") as server:
@@ -243,7 +243,7 @@ def test_a_page_whose_process_cannot_start_gets_the_reason(running, monkeypatch,
     def start(source, tell, folder):
         raise OSError(11, "no more processes")
 
-    monkeypatch.setattr(served.Page, "start", start)
+    monkeypatch.setattr(served.PageProcess, "start", start)
     with running.page() as page:
         assert "no more processes" in hear(page, "note").header["text"]
         assert first_word(page) == served.TRY_LATER

@@ -52,7 +52,7 @@ class Follower:
         self._operator = Objective(problem).of_map(problem.frame.inward(uv)).operator
         self._base = uv
 
-    def to(self, target: FloatArray, waiting: Callable[[], bool] = lambda: False) -> DragMap:
+    def move_to(self, target: FloatArray, waiting: Callable[[], bool] = lambda: False) -> DragMap:
         """Move the boundary to ``target`` (k, 2), or as far as possible within `PATIENCE`.
 
         ``waiting`` returns whether a newer target exists, so that this map is not needed.
@@ -122,6 +122,7 @@ def drag_weights(
     others = np.flatnonzero(np.isin(loop, [c for c in corners if c != vertex]))
     is_corner = vertex in corners
     for way, last in ((ahead, others[:1]), (loop_length - ahead, others[-1:])):
+        # On a side without end, a corner moves a quarter of the loop in each direction.
         end = float(way[last[0]]) if last.size else (0.25 if is_corner else 1.0) * loop_length
         if not is_corner:
             end = min(end, REACH * loop_length)

@@ -1,7 +1,7 @@
 """The steps that change a map. Each calls the library as the command does, and returns that command and a script.
 
 A step depends on the model, on its options and, if it starts from a map, on that map, which the page saves as
-`recipes.START`.
+`recipes.START`. The functions ``require_…`` check what a step needs before it starts.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from quasiharmonic.io.objects import as_seamed_mesh
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
-from quasiharmonic.targets import filled, outline_curves
+from quasiharmonic.targets import filled, nearest_on_boundary, outline_curves
 from quasiharmonic.targets.boundary.fitted_problems import find_corner_vertices, place_beside
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.ui.studio import recipes
 from quasiharmonic.ui.studio.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Script, Source, public
 from quasiharmonic.ui.studio.state import IslandState, SessionState
 from quasiharmonic.ui.studio.validation import Outline, RequestError
-from quasiharmonic.util.arrays import IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray
 
 Callback = Callable[[Step], object] | None
 # Options of the smoothing after a search.
@@ -60,7 +60,7 @@ def make_start(mesh: SeamedMesh) -> Source:
     return Source(START, MeshData(mesh.V, mesh.F, vt=mesh.uv, FT=None if mesh.uv is None else mesh.FT))
 
 
-def saved_start(mesh: SeamedMesh) -> Recipe:
+def record_start(mesh: SeamedMesh) -> Recipe:
     """Return the recipe of a map that no step makes: the file with it."""
     source = make_start(mesh)
     script = Script()
@@ -68,7 +68,7 @@ def saved_start(mesh: SeamedMesh) -> Recipe:
     return Recipe(f"qhm check {source.name}", str(script), source.start)
 
 
-def choose(state: SessionState) -> list[int] | None:
+def list_selected(state: SessionState) -> list[int] | None:
     """Return the selected islands; None if these are all."""
     return None if len(state.selected) == len(state.islands) else list(state.selected)
 
@@ -84,7 +84,7 @@ def map_to_outline(
     ``corners`` are boundary vertices of the first selected island and the outline's corners that they go to. "auto"
     chooses vertices by angle; without corners arc length decides.
     """
-    only = choose(state)
+    only = list_selected(state)
     source = find_source(state, with_map=only is not None)
     own = state.active.island.vertices
     named = () if isinstance(corners, str) else tuple((int(own[v]), k) for v, k in corners)
@@ -109,6 +109,21 @@ def map_to_outline(
     return after
 
 
+def assign_corner(state: SessionState, k: int, vertex: int, callback: Callback = None) -> SessionState:
+    """Assign the boundary vertex of island ``k`` nearest to ``vertex`` to the next corner of its outline.
+
+    RequestError if there is no outline; ValueError if the order of the corners differs from that of the vertices.
+    """
+    one = state.islands[k]
+    outline = require_outline(one)
+    near = int(nearest_on_boundary(one.island.V, one.island.F, one.island.V[vertex][None])[0])
+    before = tuple((v, c) for v, c in one.chosen if v != near)
+    if len(before) >= max(len(one.corners), 1):
+        before = ()
+    chosen = (*before, (near, len(before)))
+    return map_to_outline(replace(state, selected=(k,)), outline, chosen, callback)
+
+
 def map_in_place(
     state: SessionState, start: SeamedMesh, only: list[int] | None, callback: Callback = None, follows: bool = False
 ) -> SessionState:
@@ -127,17 +142,35 @@ def map_in_place(
     return _diagnose_selected(rebuild(state, mapped, recipe, keep=("pins", "corners")))
 
 
+def move_target(
+    state: SessionState, k: int, target: FloatArray, uv: FloatArray | None
+) -> tuple[SessionState, SeamedMesh]:
+    """Return the state with one island selected and its target moved to ``target`` (k, 2); and the mesh so moved.
+
+    ``uv`` (m, 2) is an injective map with this target, if there is one.
+    """
+    one = state.islands[k]
+    places = [island.uv for island in state.mesh.islands]
+    assert one.result is not None
+    assert one.fixed is not None
+    own = (one.result.uv if uv is None else uv).copy()
+    own[one.fixed] = target
+    places[k] = own * one.sign
+    moved = replace(state.with_island(k, one.with_target(target)), selected=(k,))
+    return moved, state.mesh.with_places(places)
+
+
 def _map(
     start: SeamedMesh,
     source: Source,
     options: dict[str, Any],
-    held: dict[str, Any],
+    fixed: dict[str, Any],
     only: list[int] | None,
     callback: Callback,
 ) -> tuple[MappedAtlas, Recipe]:
     """Search for maps with ``options`` and smooth small injective ones, as ``qhm map`` does.
 
-    ``held`` are the options of the smoothing that fix vertices. Raise Interrupted after an interrupt.
+    ``fixed`` has the option of the smoothing that fixes vertices, or is empty. Raise Interrupted after an interrupt.
     """
     script = Script()
     mesh = script.let("mesh", public(atlas.injective_map)(source.name, **options, islands=only).mesh)
@@ -147,8 +180,8 @@ def _map(
     some = [k for k in chosen if _can_be_smoothed(mapped, k)]
     if some:
         again = only if len(some) == len(chosen) else some
-        script.let("mesh", public(atlas.polish)(mesh, **held, **_SMOOTHING, islands=again).mesh)
-        smoothed = atlas.polish(mapped.mesh, **recipes.values(held), **_SMOOTHING, islands=again, callback=callback)
+        script.let("mesh", public(atlas.polish)(mesh, **fixed, **_SMOOTHING, islands=again).mesh)
+        smoothed = atlas.polish(mapped.mesh, **recipes.values(fixed), **_SMOOTHING, islands=again, callback=callback)
         _check_finished(smoothed)
         islands = [*mapped.islands]
         for k in some:
@@ -176,7 +209,7 @@ def _can_be_smoothed(mapped: MappedAtlas, k: int) -> bool:
 
 def polish_islands(state: SessionState, energy: str, slide: bool, callback: Callback = None) -> SessionState:
     """Lower an energy of the selected islands until it converges."""
-    only, source = choose(state), find_source(state, with_map=True)
+    only, source = list_selected(state), find_source(state, with_map=True)
     outline = state.active.outline if slide and len(state.islands) == 1 else None
     curves = slide if outline is None else _sliding_curves(outline)
     options = {"energy": energy, "slide": curves, "fixed": _list_fixed(state, only, slide=slide)}
@@ -192,10 +225,10 @@ def _sliding_curves(outline: Outline) -> Given:
 
 
 def flatten_islands(state: SessionState, callback: Callback = None) -> SessionState:
-    """Flatten the selected islands with free boundaries; all of them along new seams if the user drew some."""
-    if state.drawn is not None:
-        return _flatten_along(state, state.drawn, callback)
-    mesh, only = state.mesh, choose(state)
+    """Flatten the selected islands with free boundaries; all of them along the wanted seams if these changed."""
+    if state.wanted_seams is not None:
+        return _flatten_along(state, state.wanted_seams, callback)
+    mesh, only = state.mesh, list_selected(state)
     pins = _list_pins(state, state.selected)
     source = find_source(state, with_map=only is not None or pins is not None)
     cut = only is None and not all(is_flattenable(one.island) for one in state.islands)
@@ -226,7 +259,7 @@ def repair_islands(state: SessionState, callback: Callback = None) -> SessionSta
     code = script.let("mesh", public(as_seamed_mesh)(source.name))
     script.let("mesh", public(repair)(code.V, code.F, code.uv, FT=code.FT, **options).mesh)
     recipe = recipes.record_call("repair", source, "repaired.obj", options, script)
-    after = as_it_is(state, result.mesh, recipe, keep=("pins",))
+    after = rebuild_from_mesh(state, result.mesh, recipe, keep=("pins",))
     for k, (one, done) in enumerate(zip(after.islands, result.islands, strict=False)):
         if one.result is not None and done.diagnosis is not None:
             after = after.with_island(k, replace(one, result=replace(one.result, diagnosis=done.diagnosis)))
@@ -271,11 +304,13 @@ def rebuild(state: SessionState, mapped: MappedAtlas, recipe: Recipe, keep: Coll
         new = IslandState(island, one.mirrored, result)
         if same:
             new = replace(new, **{name: getattr(before, name) for name in keep})
-        islands.append(fix_where_it_is(new))
-    return replace(state, mesh=mapped.mesh, islands=tuple(islands), recipe=recipe, selected=selected, drawn=None)
+        islands.append(fix_in_place(new))
+    return replace(state, mesh=mapped.mesh, islands=tuple(islands), recipe=recipe, selected=selected, wanted_seams=None)
 
 
-def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, keep: Collection[str] = ()) -> SessionState:
+def rebuild_from_mesh(
+    state: SessionState, mesh: SeamedMesh, recipe: Recipe, keep: Collection[str] = ()
+) -> SessionState:
     """Return the state with the map of a mesh, like `rebuild`."""
     done = []
     for island, mirrored in zip(mesh.islands, mirrored_islands(mesh), strict=True):
@@ -286,12 +321,20 @@ def as_it_is(state: SessionState, mesh: SeamedMesh, recipe: Recipe, keep: Collec
     return rebuild(state, MappedAtlas(mesh, tuple(done)), recipe, keep)
 
 
-def fix_where_it_is(one: IslandState) -> IslandState:
+def fix_in_place(one: IslandState) -> IslandState:
     """Return an island whose boundary and pins are fixed at their positions in its map."""
     assert one.result is not None
     edge = np.unique(boundary_edges(one.island.F, len(one.island.vertices)))
     fixed = np.union1d(edge, np.array(one.pins, dtype=np.int64))
     return replace(one, fixed=fixed, target=one.result.uv[fixed])
+
+
+def pin_vertices(state: SessionState, k: int, pins: Sequence[int]) -> SessionState:
+    """Return a state with these pins of island ``k`` at their positions; the map stays the same."""
+    one = state.islands[k]
+    assert one.result is not None
+    pinned = fix_in_place(replace(one, pins=tuple(pins)))
+    return replace(state.with_island(k, pinned), selected=(k,))
 
 
 def _list_fixed(state: SessionState, only: Sequence[int] | None, *, slide: bool = False) -> Given | None:
@@ -322,32 +365,39 @@ def _record_cut(state: SessionState, source: Source, script: Script, mesh: Code)
     return script.let("mesh", mesh.cut(cuts))
 
 
-def _flatten_along(state: SessionState, drawn: IntArray, callback: Callback) -> SessionState:
-    """Flatten the whole surface, cut along the seams that the user drew, and where this is not enough."""
+def _flatten_along(state: SessionState, seams: IntArray, callback: Callback) -> SessionState:
+    """Flatten the whole surface, cut along seams (k, 2), and where this is not enough."""
     surface = state.sheet.surface
     source = Source(state.sheet.name, None) if state.sheet.is_file else make_start(SeamedMesh(surface.V, surface.F))
     polygons = _polygons(state, source)
     mesh = SeamedMesh(surface.V, surface.F)
-    if len(drawn):
-        mesh = cut_along(mesh, drawn, polygons=polygons)
+    if len(seams):
+        mesh = cut_along(mesh, seams, polygons=polygons)
     cut = not all(is_flattenable(island) for island in mesh.islands)
     if cut:
         mesh = cut_apart(mesh, polygons=polygons, disks_too=True)
     mapped = atlas.flatten(mesh, callback=callback)
-    saved = recipes.saved_rows(SEAMS, "seams", drawn)
+    saved = recipes.saved_rows(SEAMS, "seams", seams)
     script = Script()
     code = script.let("mesh", public(as_seamed_mesh)(source.name))
     code = script.let("mesh", public(SeamedMesh)(code.V, code.F))
-    if len(drawn):
+    if len(seams):
         code = script.let("mesh", code.cut(saved.code))
     if cut:
         code = _record_cut(state, source, script, code)
     script.let("mesh", public(atlas.flatten)(code).mesh)
-    words = {"seams": SEAMS if len(drawn) else "none", "cut": cut}
-    options = {"seams": replace(saved, words=words, texts=saved.texts if len(drawn) else {})}
+    words = {"seams": SEAMS if len(seams) else "none", "cut": cut}
+    options = {"seams": replace(saved, words=words, texts=saved.texts if len(seams) else {})}
     recipe = recipes.record_call("flatten", source, "flat.obj", options, script)
     after = rebuild(state, mapped, recipe)
-    return replace(after, from_file=False, selected=tuple(range(len(mapped.islands))))
+    return replace(after, from_file=False).select_all()
+
+
+def require_outline(one: IslandState) -> Outline:
+    """Return the outline of an island's boundary; RequestError if there is none."""
+    if one.outline is None:
+        raise RequestError("corners need an outline: choose one under Boundary first")
+    return one.outline
 
 
 def require_map(state: SessionState) -> None:

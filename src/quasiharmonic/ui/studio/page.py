@@ -29,7 +29,7 @@ _TEXTS = {
 }
 _CHOICES = {"labels": ("groups", "materials")}
 #: Names of the options, in the order of the page.
-NAMES = (
+OPTION_NAMES = (
     *("max_stretch", "max_charts", "symmetry", "hard_edges", "labels", "straighten", "up"),
     *("divide_for_packing", "texels_per_unit"),
 )
@@ -84,5 +84,5 @@ def offered_options() -> list[dict[str, Any]]:
             "default": known[name].default,
             "choices": known[name].metadata["choices"] or _CHOICES.get(name, ()),
         }
-        for name in NAMES
+        for name in OPTION_NAMES
     ]

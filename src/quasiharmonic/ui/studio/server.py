@@ -70,8 +70,8 @@ class Studio:
         self.source = source
         self.token = secrets.token_urlsafe(24) if token is None else token
         self.port = 0
-        self._pages: set[Page] = set()
-        self._sessions: dict[str, tuple[ServerConnection, Page]] = {}
+        self._pages: set[PageProcess] = set()
+        self._sessions: dict[str, tuple[ServerConnection, PageProcess]] = {}
         self._folder = ""
         self._open = 0
 
@@ -100,10 +100,10 @@ class Studio:
 
     async def _serve(self, port: int, ready: Callable[[str], object]) -> None:
         async with serve(
-            self._page,
+            self._connect_page,
             HOST,
             port,
-            process_request=self._request,
+            process_request=self._answer_request,
             max_size=MAX_BYTES + (1 << 20),
             # Read a message only after the previous one was taken, so that at most one large message waits.
             max_queue=0,
@@ -120,7 +120,7 @@ class Studio:
             finally:
                 await asyncio.gather(*(page.wait_for_end() for page in list(self._pages)))
 
-    def _request(self, connection: ServerConnection, request: Request) -> Response | None:
+    def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuse a request, answer it with a file, or return None to open a socket."""
         hosts = request.headers.get_all("Host")
         if len(hosts) != 1 or hosts[0] not in {f"{HOST}:{self.port}", f"localhost:{self.port}"}:
@@ -147,7 +147,7 @@ class Studio:
             return _answer(HTTPStatus.NOT_FOUND, "there is no such file")
         return _answer(HTTPStatus.OK, asset.content, asset.kind)
 
-    async def _page(self, connection: ServerConnection) -> None:
+    async def _connect_page(self, connection: ServerConnection) -> None:
         """Connect a page with a process, unless too many pages are open."""
         if self._open >= MAX_PAGES:
             # Close the socket instead of refusing the request, because scripts cannot read the answer to a refusal.
@@ -156,13 +156,13 @@ class Studio:
         # Count before the first await, so that pages opened at the same time cannot exceed the limit.
         self._open += 1
         try:
-            await self._carry(connection)
+            await self._forward(connection)
         except ConnectionClosed:
             pass
         finally:
             self._open -= 1
 
-    async def _carry(self, connection: ServerConnection) -> None:
+    async def _forward(self, connection: ServerConnection) -> None:
         """Forward messages between a page and its process until one of them ends."""
 
         async def tell(message: bytes) -> None:
@@ -170,10 +170,10 @@ class Studio:
 
         offered = {"options": offered_options(), "energies": ENERGY_LABELS}
         await tell(encode({"kind": "hello", "most_bytes": MAX_BYTES, **offered}))
-        session = self._session_of(connection)
+        session = self._read_session_name(connection)
         await self._take_over(session)
         try:
-            page = await Page.start(self.source, tell, str(Path(self._folder, session)) if session else "")
+            page = await PageProcess.start(self.source, tell, str(Path(self._folder, session)) if session else "")
         except OSError as error:
             reason = f"no process can be started for this page: {error.strerror or error}"
             await tell(encode({"kind": "note", "level": "error", "text": reason}))
@@ -194,7 +194,7 @@ class Studio:
             if self._sessions.get(session, (None, None))[1] is page:
                 del self._sessions[session]
 
-    def _session_of(self, connection: ServerConnection) -> str:
+    def _read_session_name(self, connection: ServerConnection) -> str:
         """Return the name of the session that a page asks for; empty if there is none."""
         assert connection.request is not None
         name = connection.request.path.partition("?session=")[2]
@@ -207,7 +207,7 @@ class Studio:
             await connection.close(ELSEWHERE, "this session was opened in another tab")
             await page.wait_for_end()
 
-    async def _listen(self, connection: ServerConnection, page: Page) -> None:
+    async def _listen(self, connection: ServerConnection, page: PageProcess) -> None:
         """Forward the messages of the page to its process."""
         try:
             async for message in connection:
@@ -246,7 +246,7 @@ def _answer(status: HTTPStatus, body: str | bytes, kind: str = "text/plain; char
     return Response(status.value, status.phrase, headers, content)
 
 
-class Page:
+class PageProcess:
     """Worker process of a page; ``tell`` sends a message of the process to the page."""
 
     def __init__(self, process: asyncio.subprocess.Process, tell: Callable[[bytes], Awaitable[None]]) -> None:
@@ -255,7 +255,7 @@ class Page:
         self._reason = ""
 
     @classmethod
-    async def start(cls, source: str, tell: Callable[[bytes], Awaitable[None]], folder: str = "") -> Page:
+    async def start(cls, source: str, tell: Callable[[bytes], Awaitable[None]], folder: str = "") -> PageProcess:
         """Start a process for a page that opens ``source``, or a built-in surface if it is empty.
 
         The process stores its session in ``folder``, and continues the one that is there.

@@ -1,55 +1,80 @@
-"""Session of a page: handle its messages, send updates, and make the files that it saves.
+"""Session of a page: handle its messages.
 
 The module is independent of sockets and processes. The caller passes in messages and transmits the updates.
+`docs/development/page_protocol.md` lists the messages with their fields. The method ``_do_COMMAND`` handles COMMAND.
+
+A message that makes a new state is an operation. Its method has the decorator `Operation`, which declares what the
+operation requires. The method only reads the fields, and returns a function that computes the state (None: there is
+nothing to do). `Session._perform` does the rest, in this order:
+
+1. Raise RequestError if the state does not meet the requirements.
+2. Call the method, which raises RequestError if a field is invalid.
+3. Tell the page that a computation starts.
+4. Compute the state, add it to the history and show it.
+
+After an error in 1 and 2 the page still shows the state. After an error in 3 and 4 `Session.handle` sends it again.
+
+The other methods make no state: they open models, select, drag, save, or switch between states. They check what they
+require themselves.
 """
 
 from __future__ import annotations
 
-import tempfile
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import wraps
 from typing import Any
 
 import numpy as np
 
-from quasiharmonic import io
 from quasiharmonic.io.models.textures import texture_of
 from quasiharmonic.ui.studio import operations, validation
 from quasiharmonic.ui.studio.drag import Follower, drag_weights
-from quasiharmonic.ui.studio.islands import (
-    add_edges,
-    add_mirrored,
-    find_chain,
-    find_seams,
-    move_islands,
-    pack_all,
-    remove_edges,
-    shortest_path,
-    stitch_seam,
-    weld_seams,
-)
+from quasiharmonic.ui.studio.islands import move_islands, pack_all, stitch_seam, weld_seams
+from quasiharmonic.ui.studio.operations import require_injective, require_map
 from quasiharmonic.ui.studio.protocol import MessageFrame
-from quasiharmonic.ui.studio.recipes import MAP, START
-from quasiharmonic.ui.studio.setup import (
-    make_first_state,
-    open_without_map,
-    pin_vertices,
-    read_options,
-    turn_over,
-    unwrap_model,
-    with_corner,
-    with_start,
-)
+from quasiharmonic.ui.studio.saved_files import list_files
+from quasiharmonic.ui.studio.seams import draw_seam, erase_seam
+from quasiharmonic.ui.studio.setup import make_first_state, open_without_map, turn_over
 from quasiharmonic.ui.studio.state import SessionState
 from quasiharmonic.ui.studio.surface import PageSurface, make_first_sheet, read_upload
+from quasiharmonic.ui.studio.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.updates import DragState, PageUpdates
 from quasiharmonic.ui.studio.validation import Outline, RequestError, make_outline, make_polygon, read_drawing
-from quasiharmonic.util.arrays import IntArray
 from quasiharmonic.util.options import ENERGIES
 
-_LARGEST_TEXTURE = 16_384
-#: Formats in which the page saves the map.
-FORMATS = "obj", "glb", "ply"
+Plan = Callable[[], SessionState] | None
+Planner = Callable[["Session", MessageFrame], Plan]
+
+
+@dataclass(frozen=True)
+class Operation:
+    """Decorator of the method of an operation; the docstring of the module states what such a method does.
+
+    Most operations would lose the seams that the user changed, so by default they are refused until the surface is cut
+    along these.
+    """
+
+    busy: str = ""  # What the page shows during the computation; empty if it takes no time
+    requires: Callable[[SessionState], None] | None = None  # Check of the selected islands, by RequestError
+    of_all: bool = False  # Whether the check concerns all islands, not only the selected ones
+    changed_seams: bool = False  # Whether it keeps the seams that the user changed, or cuts along them
+    ahead: bool = (
+        False  # Whether the page has already moved the map, so that step 3 comes first: any error moves it back
+    )
+    fit: bool = False  # Whether the page then shows the whole map
+
+    def __call__(self, plan: Planner) -> Callable[[Session, MessageFrame], None]:
+        """Return the method that performs the operation."""
+
+        @wraps(plan)
+        def perform(session: Session, frame: MessageFrame) -> None:
+            session._perform(self, plan, frame)
+
+        return perform
+
+
+_MAP_TO_OUTLINE = Operation("finding the map", fit=True)
 
 
 class Session(PageUpdates):
@@ -104,26 +129,45 @@ class Session(PageUpdates):
             self._drag_state = None
             if self._history and (self._working or not isinstance(error, RequestError)):
                 self._show()
-            # The surface of another model hides what was said before.
+            # Sent after the state, because the page removes its notes when it gets another surface.
             known = isinstance(error, ValueError | OSError | ArithmeticError | RuntimeError | ImportError)
             text = str(error) if known else f"unexpected {type(error).__name__}: {error}"
             self._tell({"kind": "note", "level": "error", "text": text}, {})
 
+    def _perform(self, rule: Operation, plan: Planner, frame: MessageFrame) -> None:
+        """Perform an operation in the order that the docstring of the module states."""
+        if rule.ahead:
+            self._tell_busy(rule.busy)
+        if not rule.changed_seams:
+            self._refuse_changed_seams()
+        if rule.requires is not None:
+            rule.requires(self.state.select_all() if rule.of_all else self.state)
+        compute = plan(self, frame)
+        if compute is None:
+            return
+        if rule.busy and not rule.ahead:
+            self._tell_busy(rule.busy)
+        self._keep(compute(), fit=rule.fit)
+
+    def _refuse_changed_seams(self) -> None:
+        if self.state.wanted_seams is not None:
+            raise RequestError("the seams have changed: press Unwrap or Flatten, which cut the surface along them")
+
     def _keep_best(self, end: operations.Interrupted) -> None:
         """After Stop, keep the map that an interrupted step had, if it is injective."""
-        best = operations.as_it_is(self.state, end.mesh, operations.saved_start(end.mesh), keep=("pins",))
-        if self._stopped and best.injective:
-            self._keep(best)
-        else:
-            self._show()
+        if self._stopped:
+            best = operations.rebuild_from_mesh(self.state, end.mesh, operations.record_start(end.mesh), keep=("pins",))
+            if best.injective:
+                return self._keep(best)
+        self._show()
 
     # --- models, selection and seams ---------------------------------------------------------------------------------
 
     def _do_load(self, frame: MessageFrame) -> None:
-        self.open(read_upload(validation.text(frame, "name"), validation.content(frame)))
+        self.open(read_upload(validation.read_text(frame, "name"), validation.read_content(frame)))
 
     def _do_image(self, frame: MessageFrame) -> None:
-        texture = texture_of(validation.content(frame))
+        texture = texture_of(validation.read_content(frame))
         if texture is None:
             raise RequestError("this file is not a PNG or JPEG image")
         self._history.texture = texture
@@ -131,154 +175,129 @@ class Session(PageUpdates):
         self._send_image()
 
     def _do_select(self, frame: MessageFrame) -> None:
-        chosen = validation.indices(frame, "islands", len(self.state.islands))
-        self._history.change(replace(self.state, selected=tuple(chosen or range(len(self.state.islands)))))
+        chosen = tuple(validation.read_indices(frame, "islands", len(self.state.islands)))
+        self._history.change(replace(self.state, selected=chosen) if chosen else self.state.select_all())
         self._show()
 
-    def _do_seam(self, frame: MessageFrame) -> None:
-        """Add the shortest path between two vertices to the seams, or to the edges that must not become seams."""
-        state, mesh = self.state, self.state.mesh
-        start, end = self._model_vertex(frame, "start"), self._model_vertex(frame, "vertex")
-        if start == end:
-            return
-        path = self._add_mirrored(frame, shortest_path(mesh.V, mesh.F, start, end))
-        if frame.header.get("forbid") is True:
-            self._keep(replace(state, forbidden=add_edges(state.forbidden, path)))
-        else:
-            kept = remove_edges(state.forbidden, path, len(mesh.V))
-            self._keep(replace(state, drawn=add_edges(find_seams(state), path), forbidden=kept))
+    @Operation(changed_seams=True)
+    def _do_seam(self, frame: MessageFrame) -> Plan:
+        start, end = self._find_model_vertex(frame, "start"), self._find_model_vertex(frame, "vertex")
+        axis, forbid = _read_symmetry(frame), frame.header.get("forbid") is True
+        return None if start == end else lambda: draw_seam(self.state, start, end, axis, forbid=forbid)
 
-    def _do_erase(self, frame: MessageFrame) -> None:
-        """Remove the nearest chain of seams, or of edges that must not become seams."""
-        state, V = self.state, self.state.mesh.V
-        seams = find_seams(state)
-        chain = find_chain(add_edges(seams, state.forbidden), V, self._model_vertex(frame, "vertex"))
-        chain = self._add_mirrored(frame, chain)
-        left = remove_edges(seams, chain, len(V))
-        drawn = state.drawn if len(left) == len(seams) else left
-        self._keep(replace(state, drawn=drawn, forbidden=remove_edges(state.forbidden, chain, len(V))))
+    @Operation(changed_seams=True)
+    def _do_erase(self, frame: MessageFrame) -> Plan:
+        vertex, axis = self._find_model_vertex(frame, "vertex"), _read_symmetry(frame)
+        return lambda: erase_seam(self.state, vertex, axis)
 
-    def _add_mirrored(self, frame: MessageFrame, edges: IntArray) -> IntArray:
-        """Return edges with their mirror images, if the message names the axis of a symmetry."""
-        axis = frame.header.get("symmetry")
-        surface = self.state.sheet.surface
-        return add_mirrored(edges, surface.V, surface.F, axis if axis in ("x", "y", "z") else None)
+    @Operation(requires=require_map, of_all=True, fit=True)
+    def _do_stitch(self, frame: MessageFrame) -> Plan:
+        vertex = self._find_model_vertex(frame, "vertex")
+        return lambda: stitch_seam(self.state, vertex)
 
-    def _do_stitch(self, frame: MessageFrame) -> None:
-        self._refuse_drawn()
-        operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
-        self._keep(stitch_seam(self.state, self._model_vertex(frame, "vertex")), fit=True)
+    @Operation(requires=require_map, of_all=True)
+    def _do_weld(self, frame: MessageFrame) -> Plan:
+        texels = validation.read_texture_size(frame)["resolution"]
+        return lambda: weld_seams(self.state, 1 / texels)
 
-    def _do_weld(self, frame: MessageFrame) -> None:
-        self._refuse_drawn()
-        operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
-        self._keep(weld_seams(self.state, 1 / _read_size(frame, 2048)["resolution"]))
-
-    def _do_repair(self, frame: MessageFrame) -> None:
-        self._refuse_drawn()
-        operations.require_map(replace(self.state, selected=tuple(range(len(self.state.islands)))))
-        self._tell_busy("repairing")
-        self._keep(operations.repair_islands(self.state, self._step))
-
-    def _model_vertex(self, frame: MessageFrame, name: str) -> int:
+    def _find_model_vertex(self, frame: MessageFrame, name: str) -> int:
         """Return the vertex of the model that a message names by its number on the page."""
         origin = self.state.numbering.origin
-        return int(origin[validation.vertex(frame, len(origin), name)])
-
-    def _do_turn(self, frame: MessageFrame) -> None:
-        self._keep(turn_over(self.state), fit=True)
+        return int(origin[validation.read_vertex(frame, len(origin), name)])
 
     # --- new maps ----------------------------------------------------------------------------------------------------
 
-    def _do_outline(self, frame: MessageFrame) -> None:
-        self._map_to(make_outline(frame.header.get("to")))
+    @_MAP_TO_OUTLINE
+    def _do_outline(self, frame: MessageFrame) -> Plan:
+        return self._map_to(make_outline(frame.header.get("to")))
 
-    def _do_drawing(self, frame: MessageFrame) -> None:
-        self._map_to(read_drawing(validation.text(frame, "name"), validation.content(frame)))
+    @_MAP_TO_OUTLINE
+    def _do_drawing(self, frame: MessageFrame) -> Plan:
+        return self._map_to(read_drawing(validation.read_text(frame, "name"), validation.read_content(frame)))
 
-    def _do_polygon(self, frame: MessageFrame) -> None:
-        self._map_to(make_polygon(validation.points(frame)))
+    @_MAP_TO_OUTLINE
+    def _do_polygon(self, frame: MessageFrame) -> Plan:
+        return self._map_to(make_polygon(validation.read_points(frame)))
 
-    def _map_to(self, outline: Outline, corners: Any = ()) -> None:
-        self._refuse_drawn()
-        self._tell_busy("finding the map")
-        self._keep(operations.map_to_outline(self.state, outline, corners, self._step), fit=True)
+    @_MAP_TO_OUTLINE
+    def _do_corners(self, frame: MessageFrame) -> Plan:
+        return self._map_to(operations.require_outline(self.state.active), "auto")
 
-    def _do_corner(self, frame: MessageFrame) -> None:
+    def _map_to(self, outline: Outline, corners: Any = ()) -> Plan:
+        return lambda: operations.map_to_outline(self.state, outline, corners, self._step)
+
+    @Operation("finding the map")
+    def _do_corner(self, frame: MessageFrame) -> Plan:
         k, vertex = self._find(frame)
-        self._tell_busy("finding the map")
-        self._keep(with_corner(self.state, k, vertex, self._step))
+        return lambda: operations.assign_corner(self.state, k, vertex, self._step)
 
-    def _do_corners(self, frame: MessageFrame) -> None:
-        outline = self.state.active.outline
-        if outline is None:
-            raise RequestError("corners need an outline: choose one under Boundary first")
-        self._map_to(outline, "auto")
+    @Operation("flattening", changed_seams=True, fit=True)
+    def _do_flatten(self, frame: MessageFrame) -> Plan:
+        return lambda: operations.flatten_islands(self.state, self._step)
 
-    def _do_flatten(self, frame: MessageFrame) -> None:
-        self._tell_busy("flattening")
-        self._keep(operations.flatten_islands(self.state, self._step), fit=True)
-
-    def _do_unwrap(self, frame: MessageFrame) -> None:
-        options = read_options(frame) | _read_size(frame, 2048)
+    @Operation("unwrapping", changed_seams=True, fit=True)
+    def _do_unwrap(self, frame: MessageFrame) -> Plan:
+        options = validation.read_options(frame) | validation.read_texture_size(frame)
         which = {name: frame.header.get(name) is True for name in ("keep_seams", "selected")}
-        self._tell_busy("unwrapping")
-        self._keep(unwrap_model(self.state, self._step, **which, **options), fit=True)
+        return lambda: unwrap_model(self.state, self._step, **which, **options)
 
-    def _do_place(self, frame: MessageFrame) -> None:
+    # --- changes of the map ------------------------------------------------------------------------------------------
+
+    @Operation("repairing", requires=require_map, of_all=True)
+    def _do_repair(self, frame: MessageFrame) -> Plan:
+        return lambda: operations.repair_islands(self.state, self._step)
+
+    @Operation(fit=True)
+    def _do_turn(self, frame: MessageFrame) -> Plan:
+        return lambda: turn_over(self.state)
+
+    @Operation("moving the islands", requires=require_map, ahead=True)
+    def _do_place(self, frame: MessageFrame) -> Plan:
         """Move, rotate, scale or mirror the selected islands."""
-        by, turn = validation.place(frame), float(validation.amount(frame, "turn", -360, 360, 0))
-        scale, mirror = float(validation.amount(frame, "scale", 1e-3, 1e3, 1)), frame.header.get("mirror") is True
-        texels = _read_size(frame, 2048)["resolution"] if "resolution" in frame.header else None
-        # The page has already moved them.
-        self._tell_busy("moving the islands")
-        self._refuse_drawn()
-        self._keep(move_islands(self.state, by, turn, scale, mirror, texels))
+        by, turn = validation.read_place(frame), float(validation.read_amount(frame, "turn", -360, 360, 0))
+        scale, mirror = float(validation.read_amount(frame, "scale", 1e-3, 1e3, 1)), frame.header.get("mirror") is True
+        texels = validation.read_texture_size(frame)["resolution"] if "resolution" in frame.header else None
+        return lambda: move_islands(self.state, by, turn, scale, mirror, texels)
 
-    def _do_pack(self, frame: MessageFrame) -> None:
-        self._refuse_drawn()
-        operations.require_injective(replace(self.state, selected=tuple(range(len(self.state.islands)))))
-        size = _read_size(frame, 1024)
-        self._tell_busy("packing")
-        self._keep(pack_all(self.state, **size), fit=True)
+    @Operation("packing", requires=require_injective, of_all=True, fit=True)
+    def _do_pack(self, frame: MessageFrame) -> Plan:
+        size = validation.read_texture_size(frame, validation.PACKING_RESOLUTION)
+        return lambda: pack_all(self.state, **size)
 
-    def _do_polish(self, frame: MessageFrame) -> None:
-        energy, slide = validation.text(frame, "energy"), frame.header.get("slide") is True
+    @Operation("lowering the distortion", requires=require_injective)
+    def _do_polish(self, frame: MessageFrame) -> Plan:
+        energy, slide = validation.read_text(frame, "energy"), frame.header.get("slide") is True
         if energy not in ENERGIES:
             raise RequestError(f"unknown energy {energy[:40]!r}: use {', '.join(ENERGIES)}")
-        self._refuse_drawn()
-        operations.require_injective(self.state)
-        self._tell_busy("lowering the distortion")
-        self._keep(operations.polish_islands(self.state, energy, slide, self._step))
-
-    def _refuse_drawn(self) -> None:
-        if self.state.drawn is not None:
-            raise RequestError("the seams have changed: press Unwrap or Flatten, which cut the surface along them")
+        return lambda: operations.polish_islands(self.state, energy, slide, self._step)
 
     # --- drags and pins ----------------------------------------------------------------------------------------------
 
-    def _do_pin(self, frame: MessageFrame) -> None:
+    @Operation(changed_seams=True)
+    def _do_pin(self, frame: MessageFrame) -> Plan:
         k, vertex = self._find(frame)
         one = self.state.islands[k]
         if any(vertex in loop for loop in one.loops):
             raise RequestError("that vertex is on the boundary, which is already fixed: drag it in the map")
         if not one.injective:
             raise RequestError("pins need a map without inverted triangles, but none was found")
-        if vertex not in one.pins:
-            self._keep(pin_vertices(self.state, k, [*one.pins, vertex]))
+        return None if vertex in one.pins else lambda: operations.pin_vertices(self.state, k, [*one.pins, vertex])
 
     def _find(self, frame: MessageFrame) -> tuple[int, int]:
         """Return island and own number of the vertex that a message names."""
         numbering = self.state.numbering
-        return numbering.find(validation.vertex(frame, len(numbering.origin)))
+        return numbering.find(validation.read_vertex(frame, len(numbering.origin)))
 
-    def _do_unpin(self, frame: MessageFrame) -> None:
+    @Operation(changed_seams=True)
+    def _do_unpin(self, frame: MessageFrame) -> Plan:
         k, vertex = self._find(frame)
-        self._keep(pin_vertices(self.state, k, [v for v in self.state.islands[k].pins if v != vertex]))
+        pins = self.state.islands[k].pins
+        left = [v for v in pins if v != vertex]
+        return None if len(left) == len(pins) else lambda: operations.pin_vertices(self.state, k, left)
 
     def _do_grab(self, frame: MessageFrame) -> None:
         k, vertex = self._find(frame)
-        self._refuse_drawn()
+        self._refuse_changed_seams()
         one = self.state.islands[k]
         if one.result is None:
             raise RequestError("there is no map to drag yet: press Unwrap or Flatten first")
@@ -293,7 +312,7 @@ class Session(PageUpdates):
         self._drag_state = DragState(k, place, share, follower)
 
     def _do_drag(self, frame: MessageFrame) -> None:
-        to, seq = validation.place(frame), validation.number(frame, "seq")
+        to, seq = validation.read_place(frame), validation.read_number(frame, "seq")
         drag = self._drag_state
         if drag is None:
             # The vertex could not be grabbed, but the page still waits for an answer.
@@ -304,27 +323,32 @@ class Session(PageUpdates):
         drag.goal = one.target + drag.share[:, None] * (to * one.sign - drag.place)
         if drag.follower is None:
             return self._tell_map({}, seq=seq, asked=drag.goal)
-        drag.shown = shown = drag.follower.to(drag.goal, self._waiting)
+        drag.shown = shown = drag.follower.move_to(drag.goal, self._waiting)
         asked = None if shown.reached else drag.goal
         fields = {"state": "following", "reached": shown.reached}
         self._tell_map(fields, seq=seq, shown=shown, asked=asked)
 
-    def _do_drop(self, frame: MessageFrame) -> None:
+    # `grab` has refused changed seams.
+    @Operation("finding the map", changed_seams=True)
+    def _do_drop(self, frame: MessageFrame) -> Plan:
         drag, self._drag_state = self._drag_state, None
         if drag is None or drag.goal is None:
-            return
-        self._tell_busy("finding the map")
-        reached = drag.shown is not None and drag.shown.reached
-        uv = drag.shown.uv if drag.shown is not None and reached else None
-        state, start = with_start(self.state, drag.island, drag.goal, uv)
-        try:
-            self._keep(operations.map_in_place(state, start, operations.choose(state), self._step, follows=reached))
-        except KeyboardInterrupt:
-            # The next message came before the final map. If the drag has a map, it is kept.
-            if reached:
-                self._keep(operations.as_it_is(state, start, operations.saved_start(start), ("pins",)))
-            else:
-                self._show()
+            return None
+        goal, shown = drag.goal, drag.shown
+        uv = shown.uv if shown is not None and shown.reached else None
+
+        def compute() -> SessionState:
+            state, start = operations.move_target(self.state, drag.island, goal, uv)
+            try:
+                only = operations.list_selected(state)
+                return operations.map_in_place(state, start, only, self._step, follows=uv is not None)
+            except KeyboardInterrupt:
+                # The next message came before the final map. If the drag has a map, it is kept.
+                if uv is None:
+                    raise
+                return operations.rebuild_from_mesh(state, start, operations.record_start(start), ("pins",))
+
+        return compute
 
     # --- history and files -------------------------------------------------------------------------------------------
 
@@ -345,7 +369,7 @@ class Session(PageUpdates):
 
     def _do_save(self, frame: MessageFrame) -> None:
         form = frame.header.get("format", "obj")
-        files = _list_files(self.state, form if isinstance(form, str) else "", self._history.texture)
+        files = list_files(self.state, form if isinstance(form, str) else "", self._history.texture)
         for name, content in files.items():
             self._tell({"kind": "file", "name": name}, {"content": np.frombuffer(content, dtype=np.uint8)})
         self._history.mark_saved()
@@ -353,47 +377,7 @@ class Session(PageUpdates):
         self._tell({"kind": "saved"}, {})
 
 
-def _read_size(frame: MessageFrame, resolution: int) -> dict[str, Any]:
-    """Return resolution, by default the given one, and padding of a texture."""
-    return {
-        "resolution": int(validation.amount(frame, "resolution", 16, _LARGEST_TEXTURE, resolution)),
-        "padding": float(validation.amount(frame, "padding", 0, 64, 4)),
-    }
-
-
-def _list_files(state: SessionState, form: str, texture: io.Texture | None) -> dict[str, bytes]:
-    """Return the files of a map by name: the model with its map, and its image.
-
-    In OBJ, also those that the command and the script read. RequestError if there is no map.
-    """
-    if form not in FORMATS:
-        raise RequestError(f"unknown format {form[:20]!r}: use {', '.join(FORMATS)}")
-    mesh = mapped_model(state, None if form == "ply" else texture)
-    files = _write(mesh, MAP if form == "obj" else f"map.{form}")
-    if form == "obj":
-        recipe = state.recipe
-        files |= recipe.texts | ({} if recipe.start is None else _write(recipe.start, START))
-    return files
-
-
-def mapped_model(state: SessionState, texture: io.Texture | None) -> io.MeshData:
-    """Return the file's mesh with the map of a state and an image; RequestError if there is no map."""
-    if state.mesh.uv is None:
-        raise RequestError("there is no map to save yet: press Unwrap or Flatten first")
-    mesh = state.sheet.mesh if state.recipe.of_file else state.sheet.mapped_file(state.mesh)
-    return mesh if texture is None else replace(mesh, texture=texture)
-
-
-def write_model(path: Path, mesh: io.MeshData) -> None:
-    """Write a mesh in the format of the suffix; without a map as OBJ."""
-    if mesh.FT is None:
-        io.write_obj(path, mesh)
-    else:
-        io.write_mapped(path, mesh)
-
-
-def _write(mesh: io.MeshData, name: str) -> dict[str, bytes]:
-    """Return a mesh as a file, with the files that belong to it."""
-    with tempfile.TemporaryDirectory() as folder:
-        write_model(Path(folder) / name, mesh)
-        return {each.name: each.read_bytes() for each in sorted(Path(folder).iterdir())}
+def _read_symmetry(frame: MessageFrame) -> str | None:
+    """Return the axis of the symmetry in which seams are mirrored; None for no symmetry."""
+    axis = frame.header.get("symmetry")
+    return axis if axis in ("x", "y", "z") else None

@@ -2,39 +2,25 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from quasiharmonic.apps.atlas.atlas_verdict import MIRROR
 from quasiharmonic.apps.atlas.atlas_verdict import certify as certify_islands
-from quasiharmonic.energies.measures import distortion
-from quasiharmonic.geometry.exact.certificate import Certificate
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
-from quasiharmonic.ui.studio.protocol import Array
 from quasiharmonic.ui.studio.recipes import Recipe
 from quasiharmonic.ui.studio.surface import PageSurface
 from quasiharmonic.ui.studio.validation import Outline
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
-
-class StateLimits(NamedTuple):
-    """Limits of the state that is sent to the page."""
-
-    # Maximum numbers of obstructions and of elements per obstruction.
-    obstructions: int = 20
-    elements: int = 2000
-    # Islands above this number are not checked for overlaps with each other after each change.
-    checked: int = 2000
-
-
-_LIMITS = StateLimits()
+# Maps with more islands are not checked for overlaps after each change, because this takes seconds.
+_MAX_CHECKED = 2000
 _NO_MAP = "there is no map yet: unwrap or flatten the model first"
 
 
@@ -48,7 +34,8 @@ class SessionState:
     recipe: Recipe  # How the map was computed
     selected: tuple[int, ...] = (0,)  # Indices of the selected islands, ascending, at least one
     from_file: bool = True  # Whether the seams are those of the file
-    drawn: IntArray | None = None  # (k, 2): edges of the seams that the user drew, if they changed
+    # (k, 2): edges of all seams that the next map shall have; None as long as these are the seams of the mesh
+    wanted_seams: IntArray | None = None
     forbidden: IntArray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))  # (k, 2): never seams
 
     @cached_property
@@ -79,14 +66,17 @@ class SessionState:
     @cached_property
     def overlapping(self) -> IntArray:
         """Pairs (p, 2) of islands that share points of the plane."""
-        if not self.mapped or len(self.islands) == 1 or len(self.islands) > _LIMITS.checked:
+        if not self.mapped or len(self.islands) == 1 or len(self.islands) > _MAX_CHECKED:
             return np.empty((0, 2), dtype=np.int64)
         return certify_islands(self.mesh).overlapping
 
     @property
     def uv(self) -> FloatArray:
-        """The map of all islands (n, 2), in the numbering of the page."""
-        return np.concatenate([place(one) for one in self.islands])
+        """The map of all islands (n, 2), in the numbering of the page; NaN for islands without a map.
+
+        It is not stored, because the history has many states.
+        """
+        return np.concatenate([one.island.uv for one in self.islands])
 
     @cached_property
     def signs(self) -> FloatArray:
@@ -121,6 +111,10 @@ class SessionState:
         """Return vertices of each island in the numbering of the page."""
         return [int(v + start) for some, start in zip(vertices, self.numbering.starts, strict=False) for v in some]
 
+    def select_all(self) -> SessionState:
+        """Return the state with all islands selected."""
+        return replace(self, selected=tuple(range(len(self.islands))))
+
     def with_island(self, k: int, island: IslandState) -> SessionState:
         """Return the state with another island of index ``k``; the mesh is unchanged."""
         islands = (*self.islands[:k], island, *self.islands[k + 1 :])
@@ -130,121 +124,9 @@ class SessionState:
         """Return the contents for a snapshot; what can be computed again is left out."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
-
-def place(one: IslandState) -> FloatArray:
-    """Return the map (m, 2) of an island on the page; NaN if it has none."""
-    return one.island.uv if one.result is None else one.result.uv * one.sign
-
-
-class DistortionMonitor:
-    """Distortion of a moving map; measured only now and then, so that large maps stay responsive."""
-
-    def __init__(self, V: FloatArray, F: Array) -> None:
-        self._V, self._F = V, F
-        self._when, self._cost = -np.inf, 0.0
-        self._numbers: dict[str, Any] = {}
-
-    def look(self, uv: FloatArray, reflected: FloatArray, *, now: bool) -> dict[str, Any]:
-        """Return energy, worst stretch, used space and scale of a map; recent values unless ``now`` is True.
-
-        ``reflected`` is the map with mirrored islands reflected.
-        """
-        began = time.perf_counter()
-        if now or began - self._when > max(0.15, 8 * self._cost):
-            measured = distortion(self._V, self._F, reflected)
-            defined = ~np.isnan(measured.isometric)
-            with np.errstate(invalid="ignore"):
-                energy = float(measured.share[defined] @ measured.symmetric_dirichlet[defined])
-            worst = float(measured.isometric[defined].max()) if defined.any() else np.inf
-            self._numbers = {
-                "energy": energy if np.isfinite(energy) else None,
-                "worst": worst if np.isfinite(worst) else None,
-                "used": _find_used_space(self._F, uv),
-                "packed": bool(uv.min() >= 0 and uv.max() <= 1),
-                "scale": measured.scale if np.isfinite(measured.scale) else 1.0,
-            }
-            self._when = time.perf_counter()
-            self._cost = self._when - began
-        return self._numbers
-
-
-def _find_used_space(F: Array, uv: FloatArray) -> float | None:
-    """Return the share of the unit square that the map covers; if the map leaves the square, that of its box."""
-    a, b, c = (uv[F[:, k]] for k in range(3))
-    area = float(np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).sum() / 2)
-    low, high = uv.min(axis=0), uv.max(axis=0)
-    box = 1.0 if low.min() >= 0 and high.max() <= 1 else float(np.prod(high - low))
-    return area / box if box > 0 and np.isfinite(area / box) else None
-
-
-def verdict(certificates: list[Certificate], overlapping: int) -> dict[str, Any]:
-    """Return the certificates of all islands as entries of a message."""
-    bad = sum(len(one.inverted) + len(one.degenerate) + len(one.nonfinite) for one in certificates)
-    bijective = [bool(one.bijective) for one in certificates]
-    if len(certificates) == 1:
-        words = certificates[0].summary()
-    else:
-        words = f"{len(bijective)} islands: {sum(one.injective for one in certificates)} injective, {sum(bijective)} "
-        pairs = f"{overlapping} {'pairs overlap' if overlapping > 1 else 'pair overlaps'}"
-        words += f"bijective. {pairs if overlapping else 'No two overlap'}."
-    return {
-        "injective": all(one.injective for one in certificates),
-        "bijective": all(bijective) and not overlapping,
-        "overlapping": overlapping,
-        "flips": bad,
-        "verdict": words,
-    }
-
-
-def bad_triangles(certificates: list[Certificate]) -> Array:
-    """Return the triangles that are not positive, (k,) uint32, in the numbering of the page."""
-    start, found = 0, [np.empty(0, dtype=np.int64)]
-    for one in certificates:
-        found += [one.inverted + start, one.degenerate + start, one.nonfinite + start]
-        start += one.triangles
-    return np.sort(np.concatenate(found)).astype(np.uint32)
-
-
-def describe_obstructions(state: SessionState) -> list[dict[str, Any]]:
-    """Return the obstructions to a map, or to a bijective map, as the page marks them."""
-    found = []
-    for one, start, first in zip(
-        state.islands, state.numbering.starts.tolist(), state.numbering.first_triangles.tolist(), strict=False
-    ):
-        diagnosis = None if one.result is None else one.result.diagnosis
-        if diagnosis is None:
-            continue
-        loops = one.problem.domain.loops
-        # Obstructions with vertices or edges are more specific than those of whole loops.
-        for each in sorted(diagnosis.obstructions, key=lambda one: not (one.vertices.size or one.edges.size)):
-            edges = each.edges if each.edges.size else np.array(_around([loops[k] for k in each.loops]), dtype=np.int64)
-            found.append(
-                {
-                    "message": each.message,
-                    "advice": each.advice,
-                    "forbids": each.forbids.value,
-                    "vertices": (each.vertices + start).tolist()[: _LIMITS.elements],
-                    "edges": (edges.reshape(-1, 2) + start).tolist()[: _LIMITS.elements],
-                    "triangles": (each.triangles + first).tolist()[: _LIMITS.elements],
-                }
-            )
-    if found and state.recipe.dragged:
-        return [_describe_drag(found)]
-    return found[: _LIMITS.obstructions]
-
-
-def _describe_drag(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what a drag did, in place of the obstructions that follow from it."""
-    crossing = any(one["edges"] and "crosses itself" in one["message"] for one in found)
-    what = (
-        "another side, so the boundary crosses itself" if crossing else "the opposite side, so the map is turned over"
-    )
-    return {**found[0], "message": f"It was dragged across {what}.", "advice": "Drag it back.", "undo": True}
-
-
-def _around(loops: list[Array]) -> list[list[int]]:
-    """Return the edges of loops."""
-    return [edge for loop in loops for edge in np.stack([loop, np.roll(loop, -1)], axis=1).tolist()]
+    def __setstate__(self, contents: dict[str, Any]) -> None:
+        """Take the contents of a snapshot; in older ones `wanted_seams` has the name ``drawn``."""
+        vars(self).update({"wanted_seams" if name == "drawn" else name: value for name, value in contents.items()})
 
 
 @dataclass(eq=False)

@@ -28,7 +28,7 @@ _HARMLESS = {"vertices without triangle", "vertices where surfaces touch"}
 
 @dataclass(frozen=True, eq=False)
 class PageSurface:
-    """Model of a page.
+    """Model of a page; values of this type are called ``sheet``, as ``surface`` is a part.
 
     The functions that map accept only surfaces. So a model with defects is cleaned first, and the cleaned surface is
     mapped. Files that are written have the model's own vertices and faces, all reversed if the user has turned it over.

@@ -1,4 +1,7 @@
-"""Extract and validate what a page gives, which is untrusted: parameters of messages, files, and outlines.
+"""Extract and validate what a page gives, which is untrusted: fields of messages, files, and outlines.
+
+Each function ``read_…`` of a message returns one field and raises RequestError if it is missing or invalid.
+`docs/development/page_protocol.md` lists the fields of each message.
 
 Files arrive as bytes, and are stored for functions that read paths. An outline is a named shape, an uploaded drawing,
 or a polygon drawn by hand. No file is read whose name comes from a page.
@@ -13,17 +16,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
+from quasiharmonic.apps.unwrapping.model_files import PARTS
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.targets import outline, outline_curves, read_svg
+from quasiharmonic.ui.studio.page import OPTION_NAMES
 from quasiharmonic.ui.studio.protocol import MessageFrame
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.options import UnwrapOptions
 
 # A decimal number of limited length.
 _NUMBER = r"\d{1,6}(?:\.\d{1,6})?"
-_WORDS = re.compile(
+_SHAPES = re.compile(
     rf"disk|ellipse:{_NUMBER}x{_NUMBER}|ring:{_NUMBER}|rect:{_NUMBER}x{_NUMBER}|polygon:\d{{1,4}}|star:\d{{1,4}}"
     r"|letter:\S|word:\S{1,20}"
 )
@@ -33,19 +40,33 @@ MAX_BYTES = 8 << 20
 MAX_POINTS = 10_000
 
 
+# Texture sizes of messages without them. The page always states both; the buttons of the notebook's widget do not, and
+# then act as calls of the library do.
+#: Side of the texture in texels: the default of `unwrap`.
+RESOLUTION = 2048
+#: Side of the texture in texels: the default of `atlas.pack`.
+PACKING_RESOLUTION = 1024
+#: Texels between islands: the default of both.
+PADDING = 4.0
+# The largest side of a texture that most graphics cards accept.
+_LARGEST_TEXTURE = 16_384
+# The maximum in the page's field, in texels.
+_LARGEST_PADDING = 64
+
+
 class RequestError(ValueError):
     """A request cannot be fulfilled and the page is unchanged; the message states the reason."""
 
 
-def vertex(frame: MessageFrame, n: int, name: str = "vertex") -> int:
+def read_vertex(frame: MessageFrame, n: int, name: str = "vertex") -> int:
     """Return a vertex index, below ``n``."""
-    value = number(frame, name)
+    value = read_number(frame, name)
     if not 0 <= value < n:
         raise RequestError(f"there is no vertex {value}: the surface has {n}, counted from 0")
     return value
 
 
-def number(frame: MessageFrame, name: str) -> int:
+def read_number(frame: MessageFrame, name: str) -> int:
     """Return an integer."""
     value = frame.header.get(name)
     if not isinstance(value, int) or isinstance(value, bool) or abs(value) >= 2**53:
@@ -53,8 +74,8 @@ def number(frame: MessageFrame, name: str) -> int:
     return value
 
 
-def place(frame: MessageFrame) -> FloatArray:
-    """Return the target position of a drag, (2,) float64."""
+def read_place(frame: MessageFrame) -> FloatArray:
+    """Return the field ``to``, a position or a vector in the plane, (2,) float64."""
     value = frame.header.get("to")
     if not isinstance(value, list) or len(value) != 2:
         raise RequestError("the message lacks the target position, two numbers")
@@ -64,7 +85,7 @@ def place(frame: MessageFrame) -> FloatArray:
     return np.array(value, dtype=np.float64)
 
 
-def text(frame: MessageFrame, name: str) -> str:
+def read_text(frame: MessageFrame, name: str) -> str:
     """Return a string of at most 200 characters."""
     value = frame.header.get(name)
     if not isinstance(value, str) or len(value) > 200:
@@ -72,7 +93,7 @@ def text(frame: MessageFrame, name: str) -> str:
     return value
 
 
-def content(frame: MessageFrame) -> bytes:
+def read_content(frame: MessageFrame) -> bytes:
     """Return the bytes of a file."""
     array = frame.arrays.get("content")
     if array is None or array.dtype != np.uint8:
@@ -80,7 +101,7 @@ def content(frame: MessageFrame) -> bytes:
     return array.tobytes()
 
 
-def points(frame: MessageFrame) -> FloatArray:
+def read_points(frame: MessageFrame) -> FloatArray:
     """Return points in the plane, (k, 2) float64."""
     array = frame.arrays.get("points")
     if array is None or array.dtype != np.float64 or array.size % 2:
@@ -88,7 +109,7 @@ def points(frame: MessageFrame) -> FloatArray:
     return array.reshape(-1, 2)
 
 
-def amount(frame: MessageFrame, name: str, low: float, high: float, default: float) -> float:
+def read_amount(frame: MessageFrame, name: str, low: float, high: float, default: float) -> float:
     """Return a number between two bounds, ``default`` if there is none."""
     value = frame.header.get(name, default)
     value = value.item() if isinstance(value, np.generic) else value
@@ -97,12 +118,33 @@ def amount(frame: MessageFrame, name: str, low: float, high: float, default: flo
     return value
 
 
-def indices(frame: MessageFrame, name: str, n: int) -> list[int]:
+def read_indices(frame: MessageFrame, name: str, n: int) -> list[int]:
     """Return a list of different indices below ``n``, ascending."""
     values = frame.header.get(name)
     if not isinstance(values, list) or not all(type(value) is int and 0 <= value < n for value in values):
         raise RequestError(f"the message lacks {name}, a list of numbers below {n}")
     return sorted(set(values))
+
+
+def read_options(frame: MessageFrame) -> dict[str, Any]:
+    """Return the options of `unwrap`; ValueError or TypeError for invalid ones."""
+    given = frame.header.get("options", {})
+    if not isinstance(given, dict) or not set(given) <= set(OPTION_NAMES):
+        raise RequestError(f"options of unwrap are {', '.join(OPTION_NAMES)}")
+    if given.get("labels", "groups") not in PARTS:
+        raise RequestError(f"labels are {' or '.join(PARTS)}")
+    if given.get("symmetry") == "none":
+        given = {**given, "symmetry": None}
+    UnwrapOptions(**given)
+    return given
+
+
+def read_texture_size(frame: MessageFrame, resolution: int = RESOLUTION) -> dict[str, Any]:
+    """Return the options ``resolution``, by default the given one, and ``padding``."""
+    return {
+        "resolution": int(read_amount(frame, "resolution", 16, _LARGEST_TEXTURE, resolution)),
+        "padding": float(read_amount(frame, "padding", 0, _LARGEST_PADDING, PADDING)),
+    }
 
 
 @contextmanager
@@ -137,7 +179,7 @@ class Outline:
 
 def make_outline(word: object) -> Outline:
     """Return the outline of a named shape, such as ``letter:R``; ValueError for other names, also those of files."""
-    if not isinstance(word, str) or not _WORDS.fullmatch(word):
+    if not isinstance(word, str) or not _SHAPES.fullmatch(word):
         raise ValueError(
             f"unknown outline {str(word)[:40]!r}: use disk, ellipse:2x1, ring:0.5, rect:2x1, polygon:6, star:5, "
             "letter:R and word:QH"
