@@ -215,6 +215,22 @@ def test_the_rest_of_a_map_is_unwrapped_like_a_whole_model(visitor):
         unwrap_model(state, labels="materials")
 
 
+@pytest.mark.slow
+def test_charts_reach_across_vertices_at_equal_positions(visitor, tmp_path):
+    V, Q = quads()
+    loose, faces = V[Q.ravel()], np.arange(Q.size).reshape(-1, 4)
+    visitor.does("load", {"content": np.frombuffer(as_obj(loose, faces), np.uint8)}, name="loose.obj")
+    visitor.does("unwrap", resolution=512)
+    assert len(visitor.session.state.islands) < 12
+    assert len(visitor.session.state.overlapping) == 0
+    (tmp_path / "map.obj").write_bytes(visitor.files()["map.obj"])
+    saved = io.read_mesh(tmp_path / "map.obj")
+    assert len(saved.V) == len(loose)
+    assert saved.rings.sizes.tolist() == [4] * len(faces)
+    visitor.does("flatten")
+    assert visitor.session.state.injective
+
+
 def test_names_of_drawings_are_no_options(visitor):
     drawing = b'<svg xmlns="http://www.w3.org/2000/svg"><path d="M0 0h9v9h-9z"/></svg>'
     visitor.does("drawing", {"content": np.frombuffer(drawing, np.uint8)}, name="-drop.svg")

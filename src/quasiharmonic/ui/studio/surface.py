@@ -98,6 +98,12 @@ class PageSurface:
         mapped = divide_polygons(replace(self.mesh, vt=mesh.uv, FT=FT))[0]
         return mapped.turn_over() if self.turned else mapped
 
+    def clean_up(self) -> PageSurface:
+        """Return the model as read, with a cleaned surface, in which vertices at equal positions are one."""
+        cleaned = clean(self.mesh.V, self.mesh.F)
+        surface = io.MeshData(cleaned.V, cleaned.F, source=self.mesh.source)
+        return replace(self, surface=surface, cleaned=cleaned, turned=False, fixed=None)
+
     def turn_over(self) -> PageSurface:
         """Return the model with the triangles of its surface reversed."""
         surface = io.MeshData(self.surface.V, self.surface.F[:, (0, 2, 1)], source=self.mesh.source)
@@ -154,7 +160,6 @@ def make_sheet(mesh: io.MeshData, name: str, fixed: IntArray | None = None) -> P
     texture = io.own_texture(mesh) if mesh.source else None
     if sound:
         return PageSurface(name, mesh, mesh, report, fixed=fixed, texture=texture)
-    cleaned = clean(mesh.V, mesh.F)
-    surface = io.MeshData(cleaned.V, cleaned.F, source=mesh.source)
-    own = None if fixed is None else np.flatnonzero(np.isin(cleaned.vertices, fixed))
-    return PageSurface(name, mesh, surface, report, cleaned, fixed=own, texture=texture)
+    sheet = PageSurface(name, mesh, mesh, report, texture=texture).clean_up()
+    own = None if fixed is None or sheet.cleaned is None else np.flatnonzero(np.isin(sheet.cleaned.vertices, fixed))
+    return replace(sheet, fixed=own)
