@@ -59,6 +59,13 @@ def test_time_to_pack_many_charts_is_reserved(monkeypatch):
     assert seconds[0] < 59.6
 
 
+def test_charts_of_an_early_end_that_do_not_fit(monkeypatch):
+    monkeypatch.setattr(sys.modules["quasiharmonic.apps.unwrapping.stages"], "run_until", lambda left, compute: None)
+    loose = np.random.default_rng(0).normal(size=(300, 3))
+    with pytest.raises(ValueError, match="ended early: 100 charts .* do not fit .* suffices, or more time"):
+        unwrap(loose, np.arange(300).reshape(-1, 3), time_limit=60, resolution=64, padding=16)
+
+
 def test_the_limit_ends_work_on_the_shapes_of_many_charts():
     chart = grow_charts(V, F, np.arange(len(F)), np.ones(F.shape), NOWHERE, 1.5)[0]
     with progress.time_limit(0.0), pytest.raises(KeyboardInterrupt):

@@ -221,21 +221,16 @@ def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:
 
     Rounding in the texture can invert a very thin triangle. Its chart is divided, and all are packed again.
     """
-    points, cleaned, rules, wanted, kept = task.points, task.cleaned, task.rules, task.wanted, task.kept
+    points, cleaned, rules, wanted = task.points, task.cleaned, task.rules, task.wanted
     charts = found.charts
     while True:
         task.report("pack")
-        packing = place_charts(
-            charts,
-            None if task.tile is None else task.tile[cleaned.triangles],
-            wanted,
-            task.size,
-            task.density,
-            task.exponent,
-            kinds=number_kinds(charts, wanted.stack, rules.mirror, points, cleaned.F),
-            closely=_PACKED_CLOSELY if found.ended else BITMAPS,
-            occupied=None if kept is None or not kept.count else (kept.layout.uv, kept.layout.rows),
-        )
+        try:
+            packing = _pack(task, charts, closely=_PACKED_CLOSELY if found.ended else BITMAPS)
+        except ValueError as error:
+            if not found.ended:
+                raise
+            raise ValueError(f"the search for charts ended early: {error}, or more time, which gives fewer") from error
         task.report("certify")
         layout = join_charts(charts, packing, len(cleaned.F))
         certificate = certify_charts(
@@ -247,6 +242,22 @@ def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:
             return PlacedCharts(charts, packing, layout, certificate)
         scale = packing.texels_per_unit / max(task.size)
         charts = mend_charts(charts, layout, faulty, scale=scale, V=points, cost=rules.cost, bound=task.bound)
+
+
+def _pack(task: Task, charts: list[Chart], *, closely: int) -> Packing:
+    """Pack charts into the texture, beside kept ones; at most ``closely`` by their shapes, further ones as boxes."""
+    kept = task.kept
+    return place_charts(
+        charts,
+        None if task.tile is None else task.tile[task.cleaned.triangles],
+        task.wanted,
+        task.size,
+        task.density,
+        task.exponent,
+        kinds=number_kinds(charts, task.wanted.stack, task.rules.mirror, task.points, task.cleaned.F),
+        closely=closely,
+        occupied=None if kept is None or not kept.count else (kept.layout.uv, kept.layout.rows),
+    )
 
 
 def collect(task: Task, found: FoundCharts, placed: PlacedCharts, began: float) -> UnwrapResult:
