@@ -122,7 +122,7 @@ def test_wrong_input_writes_nothing(model, tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", ["targets.cuts.find.shorten_cuts", "apps.unwrapping.unwrap.certify_charts"])
+@pytest.mark.parametrize("where", ["targets.cuts.find.shorten_cuts", "apps.unwrapping.stages.certify_charts"])
 def test_interrupt_writes_nothing(where, model, tmp_path, monkeypatch, capsys):
     def interrupt(*args, **options):
         signal.raise_signal(signal.SIGINT)

@@ -168,7 +168,7 @@ def test_strips_are_listed_after_a_time_limit(monkeypatch):
         while True:
             heartbeat()
 
-    monkeypatch.setattr("quasiharmonic.apps.unwrapping.unwrap.find_charts", search)
+    monkeypatch.setattr("quasiharmonic.apps.unwrapping.stages.find_charts", search)
     result = unwrap(points, np.concatenate(triangles), resolution=512, straighten=True, time_limit=2)
     assert result.status is UnwrapStatus.TIME_LIMIT
     assert [strip.straightened for strip in result.strips] == [True]

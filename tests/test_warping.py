@@ -244,6 +244,30 @@ def test_curves_are_mapped_to_curves():
     assert warped.positions[on_line] == pytest.approx(expected, abs=0.05)
 
 
+SQUARE = np.array([[20, 20], [40, 20], [40, 40], [20, 40], [20, 20]])
+
+
+@pytest.mark.parametrize(("factor", "resolution"), [(1.1, 64), (1.3, 48), (1.5, 24)])
+def test_corners_of_curves_may_become_straight(factor, resolution):
+    image = np.zeros((60, 80))
+    warp = warp_by_landmarks(image, [], [], curves=[(SQUARE, SQUARE * [factor, 1])], resolution=resolution)
+    assert warp.certificate.bijective
+
+
+def test_points_at_equal_positions_up_to_rounding_are_one():
+    angle = np.linspace(0, 2 * np.pi, 101)
+    circle = np.stack([40 + 15 * np.cos(angle), 30 + 15 * np.sin(angle)], axis=1)
+    assert (circle[0] != circle[-1]).any()
+    spoke = np.array([[10.0, 30.0], circle[50] + 1e-14])
+    curves = [(circle, circle), (spoke, spoke)]
+    warp = warp_by_landmarks(np.zeros((60, 80)), [circle[50]], [circle[50]], weights=[1e-6], curves=curves)
+    near = np.abs(warp.points - circle[50]).max(axis=1) < 1e-9
+    assert near.sum() == 1
+    np.testing.assert_allclose(warp.positions[near], circle[50:51], atol=1e-9)
+    with pytest.raises(ValueError, match="landmarks: points 0, 1 have the same position"):
+        warp_by_landmarks(np.zeros((60, 80)), [[10, 10], [10, 10 + 1e-14]], [[10, 10], [11, 10]])
+
+
 def test_one_or_two_landmarks_suffice():
     for before, after in (([[30, 20]], [[38, 25]]), ([[30, 20], [12, 30]], [[38, 25], [12, 22]])):
         warped = warp_by_landmarks(np.zeros((41, 51)), before, after, resolution=16)
@@ -281,6 +305,7 @@ def test_the_plate_energy_has_the_stated_gradient():
             r"curve 0 moves its point \(4.0, 4.0\) to \(4.0, 5.0\), but",
         ),
         ({"curves": [([[1, 1], [2, 1]], [[1, 1], [2, 2]]), ([[3, 3], [2, 1]], [[3, 3], [2, 3]])]}, "curve 1 moves its"),
+        ({"curves": [([[1, 1], [6, 1], [6, 6], [1, 1]], [[1, 1], [6, 1], [6, 6], [1, 2]])]}, "curve 0 moves its point"),
     ],
 )
 def test_invalid_landmark_options(options, message):

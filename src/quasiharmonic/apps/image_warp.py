@@ -105,13 +105,14 @@ def warp_by_landmarks(
         of energy on one pixel.
     curves : sequence of pairs of (a, 2) and (b, 2) arrays, optional
         Polylines inside the image and their target polylines, matched by equal fractions of their lengths. They are
-        sampled with a spacing of at most one mesh cell, which cuts corners between samples.
+        sampled with a spacing of at most one mesh cell, which cuts corners between samples. Points at equal positions
+        up to rounding are one, and landmarks on a curve are exact.
     smoothness : float, optional
         Length in pixels; an eighth of the image's longer side by default. Up to this distance from a landmark the warp
         is smooth like a thin plate (`quasiharmonic.energies.bending`), and its stretch does not depend on the mesh
         size. With 0 each landmark is a cusp, which becomes sharper on finer meshes.
     resolution : int
-        Number of mesh cells along the longer side.
+        Number of mesh cells along the longer side. Triangles are divided where the warp needs it.
     energy : str or Energy
         Distortion to minimise once the map is injective; see `quasiharmonic.polish`.
 
@@ -162,8 +163,13 @@ def warp_by_landmarks(
         [points[border] + interpolate_border(points[border], before[edge], after[edge], size), after[hard]]
     )
     fixed = np.concatenate([border, own[hard]])
-    # Landmarks can pass each other. The corrected reference spreads the resulting distortion from the start.
-    result = injective_map(points, F, fixed, target, reference="corrected", polish=None if length else energy)
+    # Landmarks can pass each other. The corrected reference spreads the resulting distortion from the start. Triangles
+    # between three points of a curve must be divided if these come to lie on a line.
+    result = injective_map(
+        points, F, fixed, target, reference="corrected", polish=None if length else energy, refine=True
+    )
+    if result.refined is not None:
+        points, F = result.refined.V, result.refined.F
     interrupted = result.status is Status.INTERRUPTED
     if interrupted and not result.injective:
         raise KeyboardInterrupt

@@ -66,8 +66,10 @@ def make_landmarks(
     reject(
         soft, "landmark", "landmarks", "weights: {} on the border, where landmarks are exact: give them infinite weight"
     )
-    _check_apart("landmarks", before)
-    _check_apart("target", after[np.isinf(weight)], np.flatnonzero(np.isinf(weight)))
+    # Points at this distance count as one.
+    rounding = 1e-9 * float(size.max())
+    _check_apart("landmarks", before, rounding)
+    _check_apart("target", after[np.isinf(weight)], rounding, np.flatnonzero(np.isinf(weight)))
     check_sequence("curves", curves, "pairs of polylines")
     for number, pair in enumerate(curves):
         if len(pair) != 2:
@@ -75,26 +77,29 @@ def make_landmarks(
         one, other = _resample(*pair, f"curve {number}", step)
         for name, points in ((f"curve {number}, before", one), (f"curve {number}, after", other)):
             _check_inside(name, points, ((points > 0) & (points < size)).all(axis=1), size)
-        # A closed curve ends at its first point, and curves may share points.
-        same = (one[:, None] == before).all(axis=2)
+        if np.abs(one[0] - one[-1]).max() <= rounding:
+            # A closed curve ends at its first point.
+            _check_same_target(number, one[-1:], other[-1:], other[:1], rounding)
+            one, other = one[:-1], other[:-1]
+        # Curves may share points, and landmarks may be on curves, which are exact.
+        same = np.abs(one[:, None] - before).max(axis=2) <= rounding
         new = ~same.any(axis=1)
         k, landmark = np.argwhere(same).T
-        _check_same_target(number, one[k], other[k], after[landmark], size)
-        new[-1] &= not np.array_equal(one[0], one[-1])
+        _check_same_target(number, one[k], other[k], after[landmark], rounding)
+        weight[landmark] = np.inf
         before, after = np.concatenate([before, one[new]]), np.concatenate([after, other[new]])
         weight = np.concatenate([weight, np.full(np.count_nonzero(new), np.inf)])
     return Landmarks(before, after, weight)
 
 
-def _check_same_target(number: int, points: FloatArray, ends: FloatArray, given: FloatArray, size: IntArray) -> None:
-    """Raise ValueError if points (k, 2) of a curve, which are at other landmarks, have another target than these."""
-    rounding = 1e-9 * float(size.max())
+def _check_same_target(number: int, points: FloatArray, ends: FloatArray, given: FloatArray, rounding: float) -> None:
+    """Raise ValueError if points (k, 2) of a curve have two targets, of the curve and of what is at these points."""
     different = np.flatnonzero(np.abs(ends - given).max(axis=1, initial=0.0) > rounding)
     if different.size:
         k = different[0]
         raise ValueError(
-            f"curve {number} moves its point {tuple(points[k].tolist())} to {tuple(ends[k].tolist())}, but a landmark "
-            f"or another curve moves it to {tuple(given[k].tolist())}: give both the same target"
+            f"curve {number} moves its point {tuple(points[k].tolist())} to {tuple(ends[k].tolist())}, but a landmark, "
+            f"a curve or its other end moves it to {tuple(given[k].tolist())}: give both the same target"
         )
 
 
@@ -119,12 +124,16 @@ def _weights(weights: ArrayLike | None, k: int) -> FloatArray:
     return array
 
 
-def _check_apart(name: str, array: FloatArray, numbers: IntArray | None = None) -> None:
-    """Raise ValueError if two points are at the same position."""
-    _, first, count = np.unique(array, axis=0, return_index=True, return_counts=True)
-    if (count > 1).any():
-        place = array[first[count > 1][0]]
-        same = np.flatnonzero((array == place).all(axis=1))
+def _check_apart(name: str, array: FloatArray, rounding: float, numbers: IntArray | None = None) -> None:
+    """Raise ValueError if two points are at the same position, up to rounding."""
+    from scipy.spatial import cKDTree
+
+    if len(array) < 2:
+        return
+    pairs = cKDTree(array).query_pairs(rounding, p=np.inf, output_type="ndarray")
+    if len(pairs):
+        place = array[pairs.min()]
+        same = np.flatnonzero(np.abs(array - place).max(axis=1) <= rounding)
         which = same if numbers is None else numbers[same]
         raise ValueError(
             f"{name}: {names_of('point', 'points', which)} have the same position, {tuple(place.tolist())}: keep one "
