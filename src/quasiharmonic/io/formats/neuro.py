@@ -31,6 +31,8 @@ from quasiharmonic.util.progress import use_value
 
 # The intents that the standard has for points and triangles.
 _POINTS, _TRIANGLES = 1008, 1009
+# The intent of labels, such as the regions of a parcellation.
+_LABEL = 1002
 _SIDES = {"lh": "CortexLeft", "rh": "CortexRight"}
 
 
@@ -54,8 +56,11 @@ def read_gifti(path: str | os.PathLike[str]) -> MeshData:
         return MeshData(*gifti_arrays(image), source=os.fspath(path))
 
 
-def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray:
-    """Read the values per vertex of a GIFTI file (``.func.gii``, ``.shape.gii``): (n,), or (n, k) of k arrays.
+def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray | IntArray:
+    """Read the values per vertex of a GIFTI file: (n,), or (n, k) of k arrays.
+
+    Labels (``.label.gii``: integers with the intent LABEL) are int64, other values (``.func.gii``, ``.shape.gii``)
+    float64. Labels must not be interpolated: transfer them with ``nearest=True``.
 
     Raises
     ------
@@ -64,11 +69,13 @@ def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray:
     ImportError
         If nibabel is not installed.
     """
-    arrays = [array.data for array in _read_gifti(path).darrays if array.intent not in (_POINTS, _TRIANGLES)]
-    if not arrays or any(array.shape != arrays[0].shape for array in arrays):
+    held = [array for array in _read_gifti(path).darrays if array.intent not in (_POINTS, _TRIANGLES)]
+    if not held or any(array.data.shape != held[0].data.shape for array in held):
         raise MeshFileError(path, "does not hold arrays of values of one shape")
-    values = np.stack(arrays, axis=-1).astype(np.float64)
-    return values[..., 0] if len(arrays) == 1 else values
+    values = np.stack([array.data for array in held], axis=-1)
+    labels = values.dtype.kind in "iu" and all(array.intent == _LABEL for array in held)
+    values = values.astype(np.int64 if labels else np.float64)
+    return values[..., 0] if len(held) == 1 else values
 
 
 def _read_gifti(path: str | os.PathLike[str]) -> Any:
