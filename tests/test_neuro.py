@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify, flatten, io
-from quasiharmonic.surfaces import cat, starfish
+from quasiharmonic.surfaces import cat, grid, starfish
 from quasiharmonic.ui.cli import main
 
 NEEDED = "no dependency of the tests: .ci/optional installs it"
@@ -134,6 +134,23 @@ def test_nibabel_reads_what_was_written(name, tmp_path):
     assert meta["GeometricType"] == "Flat"
 
 
+def test_labels_are_not_interpolated(tmp_path, monkeypatch):
+    gifti = pytest.importorskip("nibabel", reason=NEEDED).gifti
+    monkeypatch.chdir(tmp_path)
+    (a, F), (b, G) = grid(4, 5), grid(7, 3)
+    io.write_map("a.obj", io.MeshData(a, F), a)
+    io.write_map("b.obj", io.MeshData(b, G), b)
+    labels = (np.arange(len(a)) % 3 * 100).astype(np.int32)
+    np.savetxt("v.csv", labels)
+    for name, intent in (("v.label.gii", "NIFTI_INTENT_LABEL"), ("v.func.gii", "NIFTI_INTENT_NONE")):
+        gifti.GiftiImage(darrays=[gifti.GiftiDataArray(labels, intent)]).to_filename(name)
+    for more, whole in (("v.label.gii", True), ("v.csv", False), ("v.csv --nearest", True), ("v.func.gii", False)):
+        name, *option = more.split()
+        assert main(["transfer", "a.obj", "b.obj", "--values", name, "out.csv", *option]) == 0
+        assert np.isin(np.loadtxt("out.csv"), labels).all() == whole
+    assert main(["transfer", "a.obj", "b.obj", "-o", "c.obj", "--nearest"]) == 2
+
+
 def test_objects_of_nibabel_are_meshes(tmp_path):
     nibabel = pytest.importorskip("nibabel", reason=NEEDED)
     V, F = cat(6)
@@ -156,6 +173,15 @@ def test_objects_of_nibabel_are_meshes(tmp_path):
         np.testing.assert_array_equal(flatten(mesh).uv, expected)
     with pytest.raises(ValueError, match="1 array of points and 0 of triangles"):
         flatten(gifti.GiftiImage(darrays=[arrays[0]]))
+
+
+@pytest.mark.parametrize("name", ["lh.x.obj.gz", "lh.a.png", "rh.a.json", "lh.csv", "lh.aparc.annot", "lh.patch.png"])
+def test_names_with_the_ending_of_another_file_are_no_surfaces(name, tmp_path):
+    V, F = grid(3, 3)
+    with pytest.raises(io.MeshFileError, match="files cannot"):
+        io.write_map(tmp_path / name, io.MeshData(V, F), V)
+    for surface in ("lh.pial", "rh.pial.T1", "lh.white.preaparc.H", "lh.json.flat"):
+        assert io.format_of(surface).name == "FreeSurfer surface"
 
 
 def test_without_nibabel_the_command_to_install_it_is_named(tmp_path, monkeypatch, capsys):
