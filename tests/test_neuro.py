@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from quasiharmonic import certify, flatten, io
+from quasiharmonic import atlas, certify, flatten, io
 from quasiharmonic.surfaces import cat, grid, starfish
 from quasiharmonic.ui.cli import main
 
@@ -189,3 +189,14 @@ def test_without_nibabel_the_command_to_install_it_is_named(tmp_path, monkeypatc
     (tmp_path / "lh.pial").write_bytes(b"\xff\xff\xfe")
     assert main(["check", str(tmp_path / "lh.pial")]) == 2
     assert "[neuro]'" in capsys.readouterr().err
+
+
+def test_a_patch_is_flattened_in_python(tmp_path):
+    """A patch has vertices that no triangle uses, which `atlas.flatten` accepts, as the guide says."""
+    _, _, inside = sphere_with_patch(tmp_path)
+    patch = io.read_mesh(tmp_path / "lh.half.patch.3d")
+    flat = atlas.flatten(atlas.as_seamed_mesh(tmp_path / "lh.half.patch.3d"))
+    assert flat.verdict().bijective
+    io.write_mapped(tmp_path / "lh.half.flat.patch.3d", patch.with_places(flat.mesh))
+    numbers, _ = parse_patch(tmp_path / "lh.half.flat.patch.3d")
+    np.testing.assert_array_equal(np.abs(numbers) - 1, np.intersect1d(inside, patch.F))
