@@ -151,6 +151,31 @@ def test_labels_are_not_interpolated(tmp_path, monkeypatch):
     assert main(["transfer", "a.obj", "b.obj", "-o", "c.obj", "--nearest"]) == 2
 
 
+@pytest.mark.parametrize("where", ["file", "points"])
+def test_the_hemisphere_of_the_input_is_kept(where, tmp_path):
+    gifti = pytest.importorskip("nibabel", reason=NEEDED).gifti
+    V, F = grid(3, 3)
+    about = {"AnatomicalStructurePrimary": "CortexLeft"}
+    arrays = [
+        gifti.GiftiDataArray(np.column_stack([V, 0 * V[:, 0]]).astype(np.float32), "NIFTI_INTENT_POINTSET"),
+        gifti.GiftiDataArray(F.astype(np.int32), "NIFTI_INTENT_TRIANGLE"),
+    ]
+    image = gifti.GiftiImage(darrays=arrays)
+    (image if where == "file" else arrays[0]).meta.update(about)
+    image.to_filename(tmp_path / "100307.L.pial.surf.gii")
+    for name, mesh, expected in (
+        ("100307.L.flat.gii", io.read_mesh(tmp_path / "100307.L.pial.surf.gii"), "CortexLeft"),
+        ("rhea_flat.gii", io.read_mesh(tmp_path / "100307.L.pial.surf.gii"), "CortexLeft"),
+        ("rhea_flat.gii", io.MeshData(V, F), None),
+        ("rh.flat.gii", io.MeshData(V, F), "CortexRight"),
+        ("flat.gii", io.MeshData(V, F, source="x/LH.pial"), "CortexLeft"),
+    ):
+        io.write_map(tmp_path / name, mesh, V)
+        written = gifti.GiftiImage.from_filename(tmp_path / name)
+        assert written.darrays[0].meta.get("AnatomicalStructurePrimary") == expected
+    assert "digits beyond single precision" in io.not_held("a.glb", io.read_mesh(tmp_path / "100307.L.flat.gii"))
+
+
 def test_objects_of_nibabel_are_meshes(tmp_path):
     nibabel = pytest.importorskip("nibabel", reason=NEEDED)
     V, F = cat(6)

@@ -13,7 +13,7 @@ import re
 import warnings
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from quasiharmonic.io.atomic import encode_by, write_whole
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.models.mesh_maps import check_mapped, in_plane, vertex_places
-from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.models.meshdata import Carried, MeshData
 from quasiharmonic.io.untrusted import check_gifti, read_bytes, unpack_gzip
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.hints import explain_missing
@@ -34,6 +34,15 @@ _POINTS, _TRIANGLES = 1008, 1009
 # The intent of labels, such as the regions of a parcellation.
 _LABEL = 1002
 _SIDES = {"lh": "CortexLeft", "rh": "CortexRight"}
+# What a GIFTI file says about the part of the brain.
+_STRUCTURE = "AnatomicalStructurePrimary"
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedGifti(Carried):
+    """The contents of a GIFTI file besides its mesh that `write_gifti` keeps."""
+
+    structure: str  # Part of the brain, such as "CortexLeft"
 
 
 def read_gifti(path: str | os.PathLike[str]) -> MeshData:
@@ -53,7 +62,10 @@ def read_gifti(path: str | os.PathLike[str]) -> MeshData:
     """
     image = _read_gifti(path)
     with report_damage(path, damage=(TypeError, ValueError)):
-        return MeshData(*gifti_arrays(image), source=os.fspath(path))
+        mesh = MeshData(*gifti_arrays(image), source=os.fspath(path))
+    metadata = [image.meta, *(array.meta for array in image.darrays if array.intent == _POINTS)]
+    structure = next((found for one in metadata if (found := one.get(_STRUCTURE))), None)
+    return mesh if structure is None else replace(mesh, carried=CarriedGifti(mesh.V, mesh.F, structure))
 
 
 def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray | IntArray:
@@ -105,7 +117,8 @@ def gifti_arrays(image: Any) -> tuple[Any, Any]:
 def write_gifti(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """Write the map of a mesh as a flat GIFTI surface, compressed if the name ends in ``.gz``.
 
-    Positions are in single precision, as the standard requires. Triangles at seams are left out.
+    Positions are in single precision, as the standard requires. Triangles at seams are left out. The hemisphere is that
+    of the GIFTI file that was read; otherwise, that of names such as ``lh.…`` of the output or the input.
 
     Raises
     ------
@@ -118,8 +131,10 @@ def write_gifti(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """
     gifti = _nibabel().gifti
     flat = flat_surface(path, mesh)
-    side = _SIDES.get(Path(path).name[:2].lower()) or _SIDES.get(Path(mesh.source).name[:2].lower())
-    about = {"GeometricType": "Flat", **({"AnatomicalStructurePrimary": side} if side else {})}
+    names = (Path(name).name.lower().split(".")[0] for name in (path, mesh.source))
+    side = next((_SIDES[name] for name in names if name in _SIDES), None)
+    structure = mesh.carried.structure if isinstance(mesh.carried, CarriedGifti) else side
+    about = {"GeometricType": "Flat", **({_STRUCTURE: structure} if structure else {})}
     arrays = [
         gifti.GiftiDataArray(single_precision(path, flat.V), "NIFTI_INTENT_POINTSET", meta=about),
         gifti.GiftiDataArray(flat.F.astype(np.int32), "NIFTI_INTENT_TRIANGLE"),
