@@ -1,4 +1,4 @@
-"""Files of a data set: links in tar archives, FreeSurfer's surfaces, and messages about files that are not supported."""
+"""Files of a data set: links in tar archives, FreeSurfer's surfaces, and messages about unsupported files."""
 
 from __future__ import annotations
 
@@ -71,3 +71,20 @@ def test_surfaces_of_freesurfer_are_found(tmp_path):
     (tmp_path / "list.txt").write_text("".join(f"surf/{name}\n" for name in surfaces))
     assert [one.name for one in batch.find_problems(tmp_path / "list.txt")] == [f"surf/{name}" for name in surfaces]
     assert [one.name for one in batch.find_problems(folder / "lh.pial")] == ["lh.pial"]
+
+
+@pytest.mark.parametrize("name", ["m.zip", "m.tar.bz2", "m.tar.xz", "m.obj.gz"])
+def test_archives_that_are_not_supported_are_named(tmp_path, name):
+    (tmp_path / name).write_bytes(b"PK\3\4")
+    (tmp_path / "list.txt").write_text(f"{name}\n")
+    for source in (name, "list.txt"):
+        with pytest.raises(ValueError, match=r"\.\w+ files are not supported: pack the data set as .tar, "):
+            batch.run(tmp_path / source, tmp_path / "out")
+
+
+def test_rows_with_several_meshes(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    parquet.write_table(pyarrow.table({"name": ["a.b"], "obj": [b"1"], "stl": [b"2"]}), tmp_path / "a.parquet")
+    (sample,) = read_samples(tmp_path / "a.parquet")
+    assert sample.error == "it has several meshes: obj, stl (remove all of these columns but one)"

@@ -209,6 +209,17 @@ def test_names_with_the_ending_of_another_file_are_no_surfaces(name, tmp_path):
         assert io.format_of(surface).name == "FreeSurfer surface"
 
 
+def test_values_per_vertex_are_not_a_surface(tmp_path):
+    pytest.importorskip("nibabel", reason=NEEDED)
+    path = tmp_path / "lh.thickness"
+    path.write_bytes(b"\xff\xff\xff" + struct.pack(">iii5f", 5, 6, 1, *range(5)))
+    with pytest.raises(io.MeshFileError, match="holds values per vertex, not a surface"):
+        io.read_mesh(path)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(io.MeshFileError, match="is not a binary surface"):
+        io.read_mesh(path)
+
+
 def test_without_nibabel_the_command_to_install_it_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "nibabel", None)
     (tmp_path / "lh.pial").write_bytes(b"\xff\xff\xfe")

@@ -34,6 +34,9 @@ _POINTS, _TRIANGLES = 1008, 1009
 # The intent of labels, such as the regions of a parcellation.
 _LABEL = 1002
 _SIDES = {"lh": "CortexLeft", "rh": "CortexRight"}
+# First bytes of FreeSurfer's values per vertex, and of old surfaces of quadrilaterals. For values, the numbers of
+# vertices, of triangles and of values per vertex follow.
+_VALUES = b"\xff\xff\xff"
 # What a GIFTI file says about the part of the brain.
 _STRUCTURE = "AnatomicalStructurePrimary"
 
@@ -161,11 +164,21 @@ def read_freesurfer(path: str | os.PathLike[str]) -> MeshData:
     nibabel, data = _nibabel(), read_bytes(path)
     if data.startswith(b"#!ascii"):
         raise MeshFileError(path, "is a text file of FreeSurfer", remedy="convert it: mris_convert IN OUT.gii")
+    if _holds_values(data):
+        raise MeshFileError(path, "holds values per vertex, not a surface", remedy="use its surface, such as lh.pial")
     # A damaged file also gives MemoryError, and errors of other types.
     with report_damage(path, "is not a binary surface of FreeSurfer: ", Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         V, F = nibabel.freesurfer.read_geometry(os.fspath(path))
         return MeshData(V, F, source=os.fspath(path))
+
+
+def _holds_values(data: bytes) -> bool:
+    """Return whether the bytes are FreeSurfer's values per vertex, such as ``lh.thickness``."""
+    if len(data) < 15 or not data.startswith(_VALUES):
+        return False
+    vertices, _, values = np.frombuffer(data[3:15], dtype=">i4").tolist()
+    return len(data) == 15 + 4 * vertices * values
 
 
 def write_freesurfer(path: str | os.PathLike[str], mesh: MeshData) -> None:

@@ -26,6 +26,8 @@ GROUP_OF_FILES = 1_500_000
 _MAX_GROUP = 64
 # First bytes of FreeSurfer's surfaces and patches, of gzip (GIFTI), and of FreeSurfer's text files.
 _STARTS = b"\xff\xff\xfe", b"\xff\xff\xfd", b"\xff\xff\xff\xff", b"\x1f\x8b", b"#!ascii"
+# Endings of archives and compressed files that are not read.
+_UNSUPPORTED = ".zip", ".7z", ".rar", ".bz2", ".tbz2", ".xz", ".txz", ".zst", ".lz4", ".gz"
 
 # Start of a comment in a list; file names may contain "#" too.
 _COMMENT = re.compile(r"(?:^|\s)#")
@@ -185,12 +187,23 @@ def list_lines(path: Path) -> Generator[tuple[int, str]]:
                 yield number, text
 
 
+def _check_supported(path: Path) -> None:
+    """Raise a ValueError if a file is an archive or compressed, and not read."""
+    if path.suffix.lower() in _UNSUPPORTED:
+        raise ValueError(
+            f"{path}: {path.suffix} files are not supported: pack the data set as .tar, .tar.gz or .parquet"
+        )
+
+
 def _read_list(path: Path, plain: bool) -> Iterator[ProblemFiles]:
+    _check_supported(path)
     seen = set()
     with closing(list_lines(path)) as lines:
         for number, text in lines:
             place = Path(os.path.abspath(path.parent / text))
             if not (place.is_dir() or (is_surface_name(place) and place.is_file())):
+                if place.is_file():
+                    _check_supported(place)
                 raise ValueError(
                     f"{path}: line {number}: there is no folder and no mesh file {text[:100]!r}; "
                     "give one on each line of the list"

@@ -94,12 +94,12 @@ def read_samples(path: Path, limit: int | None = None) -> Iterator[Sample]:
     """
     seen: set[str] = set()
     for sample in _parquet_samples(path) if is_parquet(path) else _tar_samples(path, limit or MAX_BYTES):
-        _check_sample(sample, seen)
+        _check_sample(sample, seen, is_parquet(path))
         seen.add(sample.key)
         yield sample
 
 
-def _check_sample(sample: Sample, seen: set[str]) -> None:
+def _check_sample(sample: Sample, seen: set[str], is_row: bool) -> None:
     """Set the error of a sample that cannot be used."""
     first, second = (name.partition(".")[2] for name in INPUTS)
     if first in sample.files:
@@ -113,7 +113,8 @@ def _check_sample(sample: Sample, seen: set[str]) -> None:
     elif not meshes:
         sample.error = "it has no mesh"
     elif len(meshes) > 1:
-        sample.error = f"it has several meshes: {', '.join(meshes)} (the name of a problem ends at the first dot)"
+        why = "remove all of these columns but one" if is_row else "the name of a problem ends at the first dot"
+        sample.error = f"it has several meshes: {', '.join(meshes)} ({why})"
 
 
 def _is_mesh(extension: str) -> bool:
