@@ -90,6 +90,13 @@ def test_polygons_of_vtk_are_read(tmp_path):
     np.testing.assert_array_equal(mesh.F, F)
 
 
+@pytest.mark.parametrize("kind", ["vtktypeint32", "vtktypeuint8", "vtktypeint64", "vtktypefloat64"])
+def test_data_of_the_types_that_meshio_writes(tmp_path, kind):
+    path = tmp_path / "a.vtk"
+    path.write_text(HEAD + PLACES + CELLS + f"POINT_DATA 4\nFIELD FieldData 1\nu 2 4 {kind}\n1 2 3 4 5 6 7 8\n")
+    assert moved(path)[1].point_field("u", range(4)).tolist() == [[1, 2], [3, 4], [5, 6], [7, 8]]
+
+
 def test_binary_strings_and_bits_of_every_length(tmp_path):
     """The first two bits of a string give the number of bytes of its length."""
     path = tmp_path / "four.vtk"

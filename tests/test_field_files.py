@@ -83,11 +83,13 @@ def test_wrong_files_are_rejected(tmp_path):
         (np.zeros((4, 5, 6)), np.eye(4), "has shape"),
         (np.zeros((4, 5, 3, 1, 2)), np.eye(4), "has shape"),
         (np.zeros((4, 5, 3, 2, 3)), np.eye(4), "has shape"),
+        (1j * np.ones((4, 5, 2)), np.eye(4), "values of type complex64, but displacements are real"),
         (np.ones((4, 5, 1, 1, 3)), np.eye(4), "out of the plane"),
         (np.zeros((4, 5, 2)), np.eye(4)[[0, 2, 1, 3]], "its plane is not"),
         (np.zeros((4, 5, 2)), np.eye(4) + 0.3 * np.eye(4, k=1), "not perpendicular"),
     ):
-        nibabel.save(nibabel.Nifti1Image(data.astype(np.float32), affine), path)
+        kind = np.complex64 if np.iscomplexobj(data) else np.float32
+        nibabel.save(nibabel.Nifti1Image(data.astype(kind), affine), path)
         with pytest.raises(io.MeshFileError, match=message):
             io.read_field(path)
     path.write_bytes(b"no image")

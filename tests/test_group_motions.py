@@ -64,6 +64,19 @@ def gmsh4(version):
     )
 
 
+def partitioned(version):
+    """The file of version 4 after a partition: its elements belong to parts of entities, and one entity is a ghost."""
+    before, rest = gmsh4(version).split("$Entities\n")
+    entities, after = rest.split("$EndEntities\n")
+    head, *points, surface = entities.splitlines()
+    parts = [f"{k} 0 1 2 1 2 {more}" for k, more in (line.split(" ", 1) for line in points)]
+    parts.append("1 2 5 1 2 " + surface.split(" ", 1)[1])
+    return (
+        f"{before}$Entities\n0 0 1 0\n5 0 0 0 1 1 1 0 0\n$EndEntities\n"
+        f"$PartitionedEntities\n2\n1\n99 2\n{head}\n" + "\n".join(parts) + f"\n$EndPartitionedEntities\n{after}"
+    )
+
+
 def vtk():
     flags = np.isin(np.arange(len(POINTS)), BODY) + 2 * np.isin(np.arange(len(POINTS)), WALLS)
     return (
@@ -96,6 +109,8 @@ FILES = {
     "22.msh": (gmsh22, "the body", "8"),
     "40.msh": (lambda: gmsh4("4.0"), "the body", "8"),
     "41.msh": (lambda: gmsh4("4.1"), "the body", "8"),
+    "parts-40.msh": (lambda: partitioned("4.0"), "the body", "8"),
+    "parts-41.msh": (lambda: partitioned("4.1"), "the body", "8"),
     "a.vtk": (vtk, "part=1", "part=2"),
     "a.mesh": (mfem, "the body", "2"),
 }

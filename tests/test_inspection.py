@@ -190,6 +190,12 @@ class TestCommand:
         assert main(["check", str(tmp_path / "a.obj"), "--fixed", str(tmp_path / "fixed.txt")]) == 2
         assert "fixed.txt" in capsys.readouterr().err
 
+    def test_a_mesh_that_unwrap_does_not_change(self, tmp_path, capsys):
+        V, F = cat(3)
+        io.write_obj(tmp_path / "unused.obj", MeshData(np.vstack([V, V[:1] + 9]), F))
+        assert main(["check", str(tmp_path / "unused.obj")]) == 1
+        assert "qhm unwrap uses this mesh without changes." in capsys.readouterr().out
+
     def test_obstructions_are_named_if_the_map_is_not_injective(self, tmp_path, capsys):
         V, F = cat(3)
         uv = flatten(V, F).uv

@@ -193,6 +193,23 @@ def test_values_normals_and_shapes():
     assert inverse.surface(single).shape == (3,)
 
 
+def test_labels_are_those_of_the_nearest_corner(rng):
+    V, F = grid(4, 4)
+    inverse = InverseMap(V, F, V)
+    at = inverse.locate(rng.uniform(-0.1, 1.1, (200, 2)))
+    labels = rng.integers(0, 1000, (len(V), 2))
+    found = inverse.values(at, labels, nearest=True)
+    for triangle, weights, value, corners in zip(
+        at.triangle, at.barycentric, found, inverse.values(at, labels[F], per="corner", nearest=True), strict=True
+    ):
+        expected = labels[F[triangle, np.argmax(weights)]] if triangle >= 0 else [np.nan, np.nan]
+        np.testing.assert_array_equal(value, expected)
+        np.testing.assert_array_equal(corners, expected)
+    fine, G = grid(9, 9)
+    moved = SurfaceMap(InverseMap(fine, G, fine), inverse).transfer(labels, nearest=True)
+    assert np.isin(moved, labels).all()
+
+
 def test_nothing_is_outside():
     V, F = disk(3)
     inverse = InverseMap(V, F, V)

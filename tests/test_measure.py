@@ -114,6 +114,14 @@ def test_measure_reports(stretched, capsys):
     assert "isometric" in output.err
 
 
+def test_a_flat_surface_without_texture_coordinates_is_noted(stretched, tmp_path, capsys):
+    V, F = surfaces.disk(3)
+    io.write_map(tmp_path / "flat.off", io.MeshData(V, F), V)
+    for path, noted in ((tmp_path / "flat.off", True), (stretched[0], False)):
+        assert main(["measure", str(path)]) == 0
+        assert ("flat and equal to the map" in capsys.readouterr().out) == noted
+
+
 def test_measure_of_inverted_and_flat_triangles(tmp_path, capsys):
     path = tmp_path / "flat.obj"
     io.write_map(path, io.MeshData([[0, 0], [1, 0], [2, 0]], [[0, 1, 2]]), [[0, 0], [1, 0], [0, 1]])

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from quasiharmonic import certify, flatten, io
-from quasiharmonic.surfaces import cat, starfish
+from quasiharmonic import atlas, certify, flatten, io
+from quasiharmonic.surfaces import cat, grid, starfish
 from quasiharmonic.ui.cli import main
 
 NEEDED = "no dependency of the tests: .ci/optional installs it"
@@ -134,6 +134,48 @@ def test_nibabel_reads_what_was_written(name, tmp_path):
     assert meta["GeometricType"] == "Flat"
 
 
+def test_labels_are_not_interpolated(tmp_path, monkeypatch):
+    gifti = pytest.importorskip("nibabel", reason=NEEDED).gifti
+    monkeypatch.chdir(tmp_path)
+    (a, F), (b, G) = grid(4, 5), grid(7, 3)
+    io.write_map("a.obj", io.MeshData(a, F), a)
+    io.write_map("b.obj", io.MeshData(b, G), b)
+    labels = (np.arange(len(a)) % 3 * 100).astype(np.int32)
+    np.savetxt("v.csv", labels)
+    for name, intent in (("v.label.gii", "NIFTI_INTENT_LABEL"), ("v.func.gii", "NIFTI_INTENT_NONE")):
+        gifti.GiftiImage(darrays=[gifti.GiftiDataArray(labels, intent)]).to_filename(name)
+    for more, whole in (("v.label.gii", True), ("v.csv", False), ("v.csv --nearest", True), ("v.func.gii", False)):
+        name, *option = more.split()
+        assert main(["transfer", "a.obj", "b.obj", "--values", name, "out.csv", *option]) == 0
+        assert np.isin(np.loadtxt("out.csv"), labels).all() == whole
+    assert main(["transfer", "a.obj", "b.obj", "-o", "c.obj", "--nearest"]) == 2
+
+
+@pytest.mark.parametrize("where", ["file", "points"])
+def test_the_hemisphere_of_the_input_is_kept(where, tmp_path):
+    gifti = pytest.importorskip("nibabel", reason=NEEDED).gifti
+    V, F = grid(3, 3)
+    about = {"AnatomicalStructurePrimary": "CortexLeft"}
+    arrays = [
+        gifti.GiftiDataArray(np.column_stack([V, 0 * V[:, 0]]).astype(np.float32), "NIFTI_INTENT_POINTSET"),
+        gifti.GiftiDataArray(F.astype(np.int32), "NIFTI_INTENT_TRIANGLE"),
+    ]
+    image = gifti.GiftiImage(darrays=arrays)
+    (image if where == "file" else arrays[0]).meta.update(about)
+    image.to_filename(tmp_path / "100307.L.pial.surf.gii")
+    for name, mesh, expected in (
+        ("100307.L.flat.gii", io.read_mesh(tmp_path / "100307.L.pial.surf.gii"), "CortexLeft"),
+        ("rhea_flat.gii", io.read_mesh(tmp_path / "100307.L.pial.surf.gii"), "CortexLeft"),
+        ("rhea_flat.gii", io.MeshData(V, F), None),
+        ("rh.flat.gii", io.MeshData(V, F), "CortexRight"),
+        ("flat.gii", io.MeshData(V, F, source="x/LH.pial"), "CortexLeft"),
+    ):
+        io.write_map(tmp_path / name, mesh, V)
+        written = gifti.GiftiImage.from_filename(tmp_path / name)
+        assert written.darrays[0].meta.get("AnatomicalStructurePrimary") == expected
+    assert "digits beyond single precision" in io.not_held("a.glb", io.read_mesh(tmp_path / "100307.L.flat.gii"))
+
+
 def test_objects_of_nibabel_are_meshes(tmp_path):
     nibabel = pytest.importorskip("nibabel", reason=NEEDED)
     V, F = cat(6)
@@ -158,8 +200,39 @@ def test_objects_of_nibabel_are_meshes(tmp_path):
         flatten(gifti.GiftiImage(darrays=[arrays[0]]))
 
 
+@pytest.mark.parametrize("name", ["lh.x.obj.gz", "lh.a.png", "rh.a.json", "lh.csv", "lh.aparc.annot", "lh.patch.png"])
+def test_names_with_the_ending_of_another_file_are_no_surfaces(name, tmp_path):
+    V, F = grid(3, 3)
+    with pytest.raises(io.MeshFileError, match="files cannot"):
+        io.write_map(tmp_path / name, io.MeshData(V, F), V)
+    for surface in ("lh.pial", "rh.pial.T1", "lh.white.preaparc.H", "lh.json.flat"):
+        assert io.format_of(surface).name == "FreeSurfer surface"
+
+
+def test_values_per_vertex_are_not_a_surface(tmp_path):
+    pytest.importorskip("nibabel", reason=NEEDED)
+    path = tmp_path / "lh.thickness"
+    path.write_bytes(b"\xff\xff\xff" + struct.pack(">iii5f", 5, 6, 1, *range(5)))
+    with pytest.raises(io.MeshFileError, match="holds values per vertex, not a surface"):
+        io.read_mesh(path)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(io.MeshFileError, match="is not a binary surface"):
+        io.read_mesh(path)
+
+
 def test_without_nibabel_the_command_to_install_it_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "nibabel", None)
     (tmp_path / "lh.pial").write_bytes(b"\xff\xff\xfe")
     assert main(["check", str(tmp_path / "lh.pial")]) == 2
     assert "[neuro]'" in capsys.readouterr().err
+
+
+def test_a_patch_is_flattened_in_python(tmp_path):
+    """A patch has vertices that no triangle uses, which `atlas.flatten` accepts, as the guide says."""
+    _, _, inside = sphere_with_patch(tmp_path)
+    patch = io.read_mesh(tmp_path / "lh.half.patch.3d")
+    flat = atlas.flatten(atlas.as_seamed_mesh(tmp_path / "lh.half.patch.3d"))
+    assert flat.verdict().bijective
+    io.write_mapped(tmp_path / "lh.half.flat.patch.3d", patch.with_places(flat.mesh))
+    numbers, _ = parse_patch(tmp_path / "lh.half.flat.patch.3d")
+    np.testing.assert_array_equal(np.abs(numbers) - 1, np.intersect1d(inside, patch.F))

@@ -266,7 +266,7 @@ class InverseMap(ReadOnly):
         """
         return self.values(at, self._normals, per="triangle")
 
-    def values(self, at: SurfacePoints, values: ArrayLike, *, per: Per = "vertex") -> FloatArray:
+    def values(self, at: SurfacePoints, values: ArrayLike, *, per: Per = "vertex", nearest: bool = False) -> FloatArray:
         """Interpolate values at points of the surface.
 
         Parameters
@@ -277,11 +277,14 @@ class InverseMap(ReadOnly):
             may be discontinuous across edges.
         per : {"vertex", "corner", "triangle"}
             The elements that the values belong to.
+        nearest : bool
+            Instead of interpolating, take the value of the corner with the largest barycentric coordinate: for labels.
 
         Returns
         -------
         (..., ...) float64
-            Interpolated linearly on each triangle, or the triangle's value. NaN if there is no point.
+            Interpolated linearly on each triangle, or the value of the nearest corner or of the triangle. NaN if there
+            is no point.
 
         Raises
         ------
@@ -291,6 +294,7 @@ class InverseMap(ReadOnly):
         # Points per block, so that the arrays fit into the cache.
         points_per_block = 1 << 14
         check_choice("per", per, get_args(Per))
+        check_bool("nearest", nearest)
         given = real_array("values", values)
         expected = {"vertex": (len(self.V),), "corner": (len(self.F), 3), "triangle": (len(self.F),)}[per]
         if given.shape[: len(expected)] != expected:
@@ -306,8 +310,12 @@ class InverseMap(ReadOnly):
         out = np.full((triangle.size, *tail), np.nan)
         if per == "triangle":
             out[found] = given[t]
+            return out.reshape(*triangle.shape, *tail)
+        barycentric = barycentric.reshape(-1, 3)
+        if nearest:
+            corner = barycentric[found].argmax(axis=1)
+            out[found] = given[self.F[t, corner]] if per == "vertex" else given[t, corner]
         else:
-            barycentric = barycentric.reshape(-1, 3)
             for start in range(0, t.size, points_per_block):
                 which, here = found[start : start + points_per_block], t[start : start + points_per_block]
                 weights = barycentric[which].reshape(-1, 3, *(1,) * len(tail))

@@ -86,7 +86,9 @@ class SurfaceMap:
         """Return the map φ⁻¹∘ψ from the target to the source."""
         return SurfaceMap(self.target, self.source)
 
-    def transfer(self, values: ArrayLike, *, per: Per = "vertex", outside: Outside = "nan") -> FloatArray:
+    def transfer(
+        self, values: ArrayLike, *, per: Per = "vertex", outside: Outside = "nan", nearest: bool = False
+    ) -> FloatArray:
         """Transfer values from the target to the vertices of the source.
 
         Parameters
@@ -98,6 +100,9 @@ class SurfaceMap:
             The value of vertices without a corresponding point: NaN, or the value at the nearest point of the target's
             image in the plane. Rounding and different boundary vertices can leave such vertices at the boundary.
             Vertices without a finite position always get NaN.
+        nearest : bool
+            For labels: instead of interpolating, take the value of the nearest corner of the triangle; see
+            `InverseMap.values`.
 
         Returns
         -------
@@ -113,7 +118,7 @@ class SurfaceMap:
         at = self.target.locate(self.source.uv)
         if outside == "nearest":
             at = self.target.nearest(self.source.uv, at)
-        return self.target.values(at, values, per=per)
+        return self.target.values(at, values, per=per, nearest=nearest)
 
 
 def _outline(mapped: InverseMap) -> set[tuple[tuple[float, float], ...]]:

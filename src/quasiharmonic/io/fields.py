@@ -179,9 +179,12 @@ def _read_nifti(path: str | os.PathLike[str]) -> DisplacementField:
     with report_damage(path, "is not valid NIfTI: ", Exception):
         image: Any = nibabel.load(path)
         check_size(8 * prod(image.shape), "its header announces")
-        data = np.asarray(image.dataobj, dtype=np.float64)
+        data = np.asarray(image.dataobj)
         affine = np.asarray(image.affine, dtype=np.float64)
         intent = int(image.header["intent_code"])
+    if data.dtype.kind not in "iuf":
+        raise MeshFileError(path, f"has values of type {data.dtype}, but displacements are real numbers")
+    data = data.astype(np.float64)
     volume = data.ndim > 3 and data.shape[2] > 1
     count = data.shape[-1]
     if data.ndim < 3 or count not in ((3,) if volume else (2, 3)) or any(n != 1 for n in data.shape[2 + volume : -1]):

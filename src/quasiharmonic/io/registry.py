@@ -109,6 +109,12 @@ def import_later(module: str, **names: str) -> dict[str, Any]:
     return {field: later(name) for field, name in names.items()}
 
 
+# Endings of files beside FreeSurfer's surfaces that are not surfaces, such as lh.aparc.annot, and of other files.
+_NO_SURFACES = (
+    "annot|ctab|label|mgh|mgz|nii|stats|bz2|gz|tar|tgz|xz|zip|zst|csv|html?|json|list|log|lst|md|npy|parquet|pdf|py|toml|"
+    "tsv|txt|xml|ya?ml|bmp|exr|gif|hdr|jpe?g|png|svg|tiff?|webp|3mf|blend|dae|fbx|mtl|mp4|usd[acz]?|wrl|x3d"
+)
+
 #: All formats, in the order of help texts and messages.
 FORMATS: tuple[Format, ...] = (
     Format(
@@ -157,7 +163,7 @@ FORMATS: tuple[Format, ...] = (
     Format(
         name="FreeSurfer patch",
         suffix=".patch.3d",
-        pattern=r".*\.patch(\.\w+)?",
+        pattern=rf".*\.patch(\.(?!({_NO_SURFACES})$)\w+)?",
         single_file=False,
         **import_later("formats.neuro", read="read_patch", write_map="write_patch", list_losses="not_in_patch"),
         **import_later("formats.neuro", read_written="read_written_patch"),
@@ -165,7 +171,7 @@ FORMATS: tuple[Format, ...] = (
     Format(
         name="FreeSurfer surface",
         suffix=".surf",
-        pattern=r"[lr]h\..+",
+        pattern=rf"[lr]h\.(?!(.*\.)?({_NO_SURFACES})$).+",
         requires="nibabel",
         **import_later("formats.neuro", read="read_freesurfer", write_map="write_freesurfer"),
         **import_later("formats.neuro", list_losses="not_in_flat_surface"),
@@ -221,6 +227,12 @@ def format_of(path: FilePath) -> Format | None:
         if form.suffix == suffix:
             return form
     return next((form for form in FORMATS if form.pattern and re.fullmatch(form.pattern, name)), None)
+
+
+def is_surface_name(path: FilePath) -> bool:
+    """Return whether a surface can be read from a file of this name."""
+    form = format_of(path)
+    return form is not None and form.read is not None
 
 
 def suffixes(*needs: Feature) -> tuple[str, ...]:

@@ -29,6 +29,8 @@ _DIMENSIONS = {
     **dict.fromkeys(_SURFACES, 2),
     **dict.fromkeys(_SOLIDS, 3),
 }
+# Sections of the entities of version 4. In a mesh that was partitioned, elements belong to those of the second.
+_ENTITIES = b"Entities", b"PartitionedEntities"
 # Elements of a kind: the kind, the physical group (version 2) or entity (version 4) of each, and the tags of the nodes.
 _Block: TypeAlias = tuple[int, IntArray, IntArray]
 _NAMES = {
@@ -70,7 +72,7 @@ def read_gmsh(data: bytes, solid: bool = False) -> MeshParts:
             blocks = list(_blocks(data, begin, end, version, order, solid))
             found = [nodes for kind, _, nodes in blocks if kind in (_SOLIDS if solid else _ELEMENTS)]
             elements.append((join_solids if solid else join_elements)(found))
-        elif name in (b"PhysicalNames", b"Entities"):
+        elif name in (b"PhysicalNames", *_ENTITIES):
             spans[name] = begin, end
         elif name == b"NodeData":
             title = TableReader(data, begin, end, "<")
@@ -236,7 +238,10 @@ def _find_sets(
                 names[int(words[0]), int(words[1])] = words[2].strip(b'"').decode("utf-8", "replace")
     groups: dict[tuple[int, int], list[int]] | None = None
     if version != "2":
-        groups = _groups_of_entities(data, spans[b"Entities"], version, order) if b"Entities" in spans else {}
+        groups = {}
+        for section in _ENTITIES:
+            if section in spans:
+                groups |= _groups_of_entities(data, spans[section], version, order, section != _ENTITIES[0])
     found: dict[str, list[IntArray]] = {}
     for kind, numbers, nodes in blocks:
         for number in np.unique(numbers).tolist():
@@ -250,13 +255,20 @@ def _find_sets(
 
 
 def _groups_of_entities(
-    data: bytes, span: tuple[int, int], version: str, order: str | None
+    data: bytes, span: tuple[int, int], version: str, order: str | None, partitioned: bool
 ) -> dict[tuple[int, int], list[int]]:
     """Return the physical groups of the entities of version 4, by their dimensions and tags."""
     reader, groups = TableReader(data, *span, order), {}
+    if partitioned:
+        _, ghosts = reader.read_numbers("u8", 2).tolist()
+        reader.skip_numbers("i4", 2 * ghosts)
     for dimension, count in enumerate(reader.read_numbers("u8", 4).tolist()):
         for _ in range(count):
             tag = int(reader.read_numbers("i4", 1)[0])
+            if partitioned:
+                # Skip the entity that was divided, and the partitions.
+                reader.skip_numbers("i4", 2)
+                reader.skip_numbers("i4", int(reader.read_numbers("u8", 1)[0]))
             reader.skip_numbers("f8", 3 if version == "4.1" and dimension == 0 else 6)
             groups[dimension, tag] = reader.read_numbers("i4", int(reader.read_numbers("u8", 1)[0])).tolist()
             if dimension:

@@ -26,8 +26,9 @@ _KINDS = {
     b"float": "f4",
     b"double": "f8",
     b"vtkidtype": "i4",
-    b"vtktypeint64": "i8",
-    b"vtktypeuint64": "u8",
+    **{f"vtktype{kind}{8 * n}".encode(): f"{kind[0]}{n}" for kind in ("int", "uint") for n in (1, 2, 4, 8)},
+    b"vtktypefloat32": "f4",
+    b"vtktypefloat64": "f8",
 }
 # Number of values per point of the attributes whose name determines it.
 _COMPONENTS = {b"VECTORS": 3, b"NORMALS": 3, b"TENSORS": 9, b"TENSORS6": 6, b"GLOBAL_IDS": 1, b"PEDIGREE_IDS": 1}

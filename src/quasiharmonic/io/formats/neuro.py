@@ -13,7 +13,7 @@ import re
 import warnings
 from contextlib import AbstractContextManager
 from contextvars import ContextVar
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from quasiharmonic.io.atomic import encode_by, write_whole
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.models.mesh_maps import check_mapped, in_plane, vertex_places
-from quasiharmonic.io.models.meshdata import MeshData
+from quasiharmonic.io.models.meshdata import Carried, MeshData
 from quasiharmonic.io.untrusted import check_gifti, read_bytes, unpack_gzip
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.hints import explain_missing
@@ -31,7 +31,21 @@ from quasiharmonic.util.progress import use_value
 
 # The intents that the standard has for points and triangles.
 _POINTS, _TRIANGLES = 1008, 1009
+# The intent of labels, such as the regions of a parcellation.
+_LABEL = 1002
 _SIDES = {"lh": "CortexLeft", "rh": "CortexRight"}
+# First bytes of FreeSurfer's values per vertex, and of old surfaces of quadrilaterals. For values, the numbers of
+# vertices, of triangles and of values per vertex follow.
+_VALUES = b"\xff\xff\xff"
+# What a GIFTI file says about the part of the brain.
+_STRUCTURE = "AnatomicalStructurePrimary"
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedGifti(Carried):
+    """The contents of a GIFTI file besides its mesh that `write_gifti` keeps."""
+
+    structure: str  # Part of the brain, such as "CortexLeft"
 
 
 def read_gifti(path: str | os.PathLike[str]) -> MeshData:
@@ -51,11 +65,17 @@ def read_gifti(path: str | os.PathLike[str]) -> MeshData:
     """
     image = _read_gifti(path)
     with report_damage(path, damage=(TypeError, ValueError)):
-        return MeshData(*gifti_arrays(image), source=os.fspath(path))
+        mesh = MeshData(*gifti_arrays(image), source=os.fspath(path))
+    metadata = [image.meta, *(array.meta for array in image.darrays if array.intent == _POINTS)]
+    structure = next((found for one in metadata if (found := one.get(_STRUCTURE))), None)
+    return mesh if structure is None else replace(mesh, carried=CarriedGifti(mesh.V, mesh.F, structure))
 
 
-def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray:
-    """Read the values per vertex of a GIFTI file (``.func.gii``, ``.shape.gii``): (n,), or (n, k) of k arrays.
+def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray | IntArray:
+    """Read the values per vertex of a GIFTI file: (n,), or (n, k) of k arrays.
+
+    Labels (``.label.gii``: integers with the intent LABEL) are int64, other values (``.func.gii``, ``.shape.gii``)
+    float64. Labels must not be interpolated: transfer them with ``nearest=True``.
 
     Raises
     ------
@@ -64,11 +84,13 @@ def read_gifti_values(path: str | os.PathLike[str]) -> FloatArray:
     ImportError
         If nibabel is not installed.
     """
-    arrays = [array.data for array in _read_gifti(path).darrays if array.intent not in (_POINTS, _TRIANGLES)]
-    if not arrays or any(array.shape != arrays[0].shape for array in arrays):
+    held = [array for array in _read_gifti(path).darrays if array.intent not in (_POINTS, _TRIANGLES)]
+    if not held or any(array.data.shape != held[0].data.shape for array in held):
         raise MeshFileError(path, "does not hold arrays of values of one shape")
-    values = np.stack(arrays, axis=-1).astype(np.float64)
-    return values[..., 0] if len(arrays) == 1 else values
+    values = np.stack([array.data for array in held], axis=-1)
+    labels = values.dtype.kind in "iu" and all(array.intent == _LABEL for array in held)
+    values = values.astype(np.int64 if labels else np.float64)
+    return values[..., 0] if len(held) == 1 else values
 
 
 def _read_gifti(path: str | os.PathLike[str]) -> Any:
@@ -98,7 +120,8 @@ def gifti_arrays(image: Any) -> tuple[Any, Any]:
 def write_gifti(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """Write the map of a mesh as a flat GIFTI surface, compressed if the name ends in ``.gz``.
 
-    Positions are in single precision, as the standard requires. Triangles at seams are left out.
+    Positions are in single precision, as the standard requires. Triangles at seams are left out. The hemisphere is that
+    of the GIFTI file that was read; otherwise, that of names such as ``lh.…`` of the output or the input.
 
     Raises
     ------
@@ -111,8 +134,10 @@ def write_gifti(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """
     gifti = _nibabel().gifti
     flat = flat_surface(path, mesh)
-    side = _SIDES.get(Path(path).name[:2].lower()) or _SIDES.get(Path(mesh.source).name[:2].lower())
-    about = {"GeometricType": "Flat", **({"AnatomicalStructurePrimary": side} if side else {})}
+    names = (Path(name).name.lower().split(".")[0] for name in (path, mesh.source))
+    side = next((_SIDES[name] for name in names if name in _SIDES), None)
+    structure = mesh.carried.structure if isinstance(mesh.carried, CarriedGifti) else side
+    about = {"GeometricType": "Flat", **({_STRUCTURE: structure} if structure else {})}
     arrays = [
         gifti.GiftiDataArray(single_precision(path, flat.V), "NIFTI_INTENT_POINTSET", meta=about),
         gifti.GiftiDataArray(flat.F.astype(np.int32), "NIFTI_INTENT_TRIANGLE"),
@@ -139,11 +164,21 @@ def read_freesurfer(path: str | os.PathLike[str]) -> MeshData:
     nibabel, data = _nibabel(), read_bytes(path)
     if data.startswith(b"#!ascii"):
         raise MeshFileError(path, "is a text file of FreeSurfer", remedy="convert it: mris_convert IN OUT.gii")
+    if _holds_values(data):
+        raise MeshFileError(path, "holds values per vertex, not a surface", remedy="use its surface, such as lh.pial")
     # A damaged file also gives MemoryError, and errors of other types.
     with report_damage(path, "is not a binary surface of FreeSurfer: ", Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         V, F = nibabel.freesurfer.read_geometry(os.fspath(path))
         return MeshData(V, F, source=os.fspath(path))
+
+
+def _holds_values(data: bytes) -> bool:
+    """Return whether the bytes are FreeSurfer's values per vertex, such as ``lh.thickness``."""
+    if len(data) < 15 or not data.startswith(_VALUES):
+        return False
+    vertices, _, values = np.frombuffer(data[3:15], dtype=">i4").tolist()
+    return len(data) == 15 + 4 * vertices * values
 
 
 def write_freesurfer(path: str | os.PathLike[str], mesh: MeshData) -> None:

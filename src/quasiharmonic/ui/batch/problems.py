@@ -13,6 +13,7 @@ from pathlib import Path
 from quasiharmonic.io import problem_files, suffixes
 from quasiharmonic.io.errors import check_path
 from quasiharmonic.io.mesh_files import INPUTS
+from quasiharmonic.io.registry import is_surface_name
 from quasiharmonic.util.arrays import check_bool
 
 #: A file that marks a folder as the output of a run; problems are not searched there.
@@ -23,6 +24,10 @@ SMALL_FILE = 100_000
 GROUP_OF_FILES = 1_500_000
 # Largest number of problems in a group. If one of them fails, the rest of the group is solved one by one.
 _MAX_GROUP = 64
+# First bytes of FreeSurfer's surfaces and patches, of gzip (GIFTI), and of FreeSurfer's text files.
+_STARTS = b"\xff\xff\xfe", b"\xff\xff\xfd", b"\xff\xff\xff\xff", b"\x1f\x8b", b"#!ascii"
+# Endings of archives and compressed files that are not read.
+_UNSUPPORTED = ".zip", ".7z", ".rar", ".bz2", ".tbz2", ".xz", ".txz", ".zst", ".lz4", ".gz"
 
 # Start of a comment in a list; file names may contain "#" too.
 _COMMENT = re.compile(r"(?:^|\s)#")
@@ -88,7 +93,7 @@ def find_problems(source: str | os.PathLike[str], *, plain: bool = False) -> Ite
         yield from _find_problems_below(path, "", plain, frozenset())
     elif not path.exists():
         raise ValueError(f"there is no folder, list or mesh {source}")
-    elif path.suffix.lower() in suffixes("read"):
+    elif is_surface_name(path):
         yield ProblemFiles(path.name, path, None)
     else:
         yield from _read_list(path, plain)
@@ -145,8 +150,22 @@ def _find_problems_below(
         inner = f"{name}/{entry}" if name else entry
         if is_folder:
             yield from _find_problems_below(folder / entry, inner, plain, above | {here})
-        elif plain and os.path.splitext(entry)[1].lower() in suffixes("read"):
+        elif plain and _is_surface(folder / entry):
             yield ProblemFiles(inner, folder / entry, None)
+
+
+def _is_surface(path: Path) -> bool:
+    """Whether a file in a folder is a surface, by its name.
+
+    Other files, such as ``lh.thickness``, have names like FreeSurfer's surfaces, so these are known by their content.
+    """
+    if path.suffix.lower() in suffixes("read") or not is_surface_name(path) or not path.is_file():
+        return is_surface_name(path)
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(_STARTS[-1])).startswith(_STARTS)
+    except OSError:
+        return True
 
 
 def _is_folder(entry: os.DirEntry[str]) -> bool:
@@ -168,12 +187,23 @@ def list_lines(path: Path) -> Generator[tuple[int, str]]:
                 yield number, text
 
 
+def _check_supported(path: Path) -> None:
+    """Raise a ValueError if a file is an archive or compressed, and not read."""
+    if path.suffix.lower() in _UNSUPPORTED:
+        raise ValueError(
+            f"{path}: {path.suffix} files are not supported: pack the data set as .tar, .tar.gz or .parquet"
+        )
+
+
 def _read_list(path: Path, plain: bool) -> Iterator[ProblemFiles]:
+    _check_supported(path)
     seen = set()
     with closing(list_lines(path)) as lines:
         for number, text in lines:
             place = Path(os.path.abspath(path.parent / text))
-            if not (place.is_dir() or (place.suffix.lower() in suffixes("read") and place.is_file())):
+            if not (place.is_dir() or (is_surface_name(place) and place.is_file())):
+                if place.is_file():
+                    _check_supported(place)
                 raise ValueError(
                     f"{path}: line {number}: there is no folder and no mesh file {text[:100]!r}; "
                     "give one on each line of the list"

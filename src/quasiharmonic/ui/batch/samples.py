@@ -94,13 +94,12 @@ def read_samples(path: Path, limit: int | None = None) -> Iterator[Sample]:
     """
     seen: set[str] = set()
     for sample in _parquet_samples(path) if is_parquet(path) else _tar_samples(path, limit or MAX_BYTES):
-        if sample.error is None:
-            _check_sample(sample, seen)
+        _check_sample(sample, seen, is_parquet(path))
         seen.add(sample.key)
         yield sample
 
 
-def _check_sample(sample: Sample, seen: set[str]) -> None:
+def _check_sample(sample: Sample, seen: set[str], is_row: bool) -> None:
     """Set the error of a sample that cannot be used."""
     first, second = (name.partition(".")[2] for name in INPUTS)
     if first in sample.files:
@@ -109,10 +108,13 @@ def _check_sample(sample: Sample, seen: set[str]) -> None:
     if sample.key in seen:
         sample.error = f"the name {sample.key} is used twice in the archive"
         sample.key = next(name for number in count(2) if (name := f"{sample.key} ({number})") not in seen)
+    elif sample.error is not None:
+        return
     elif not meshes:
         sample.error = "it has no mesh"
     elif len(meshes) > 1:
-        sample.error = f"it has several meshes: {', '.join(meshes)} (the name of a problem ends at the first dot)"
+        why = "remove all of these columns but one" if is_row else "the name of a problem ends at the first dot"
+        sample.error = f"it has several meshes: {', '.join(meshes)} ({why})"
 
 
 def _is_mesh(extension: str) -> bool:
@@ -168,6 +170,9 @@ def _tar_parts(file: BinaryIO, limit: int) -> Iterator[Sample | Damage]:
             yield member
             continue
         sample = sample or Sample(key)
+        if member.link is not None and _is_wanted(member.name):
+            what = f"{ascii(member.name)[1:-1]} is a link to {ascii(member.link)[1:-1]}, which a stream cannot follow"
+            sample.error = f"{what}: repack with tar --hard-dereference -h"
         if member.data is not None:
             sample.files[extension] = member.data
     if sample is not None:

@@ -12,8 +12,10 @@ from quasiharmonic.io.untrusted import MAX_BYTES
 
 _BLOCK = tarfile.BLOCKSIZE
 _CHUNK = 1 << 20
-# Types of headers about the next member: its long name (GNU), extended attributes (POSIX), and attributes of all.
-_LONG_NAME, _ATTRIBUTES, _GLOBAL = tarfile.GNUTYPE_LONGNAME, tarfile.XHDTYPE, tarfile.XGLTYPE
+# Types of headers about the next member: its long name and link (GNU), and extended attributes (POSIX).
+_LONG_NAME, _LONG_LINK, _ATTRIBUTES = tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE
+# Type of a header about all members.
+_GLOBAL = tarfile.XGLTYPE
 # Longest header about the next member, in bytes.
 _MAX_HEADER = 1 << 20
 
@@ -25,6 +27,7 @@ class Member(NamedTuple):
     data: bytes | None  # None if it was not asked for
     start: int  # Offset of the first header that belongs to the member
     end: int  # Offset after its data and padding
+    link: str | None = None  # The file that a hard or symbolic link refers to; a link has no data
 
 
 class Damage(NamedTuple):
@@ -62,8 +65,8 @@ def read_members(
     Yields
     ------
     Member or Damage
-        Regular files, and parts that cannot be read: damaged and too large ones. After a damaged header the next valid
-        one is searched.
+        Regular files and links, and parts that cannot be read: damaged and too large ones. After a damaged header the
+        next valid one is searched.
     """
     reader = _TarReader(file)
     try:
@@ -100,7 +103,7 @@ class _TarReader:
                 damaged, attributes = True, {}
                 continue
             damaged = False
-            if info.type in (_LONG_NAME, _ATTRIBUTES):
+            if info.type in (_LONG_NAME, _LONG_LINK, _ATTRIBUTES):
                 if info.size > _MAX_HEADER:
                     yield Damage(self.start, "a header is too long")
                     damaged = True
@@ -109,9 +112,12 @@ class _TarReader:
                 continue
             name = attributes.get("path", info.name)
             size = int(attributes.get("size", info.size))
+            link = attributes.get("linkpath", info.linkname)
             attributes = {}
-            if not info.isreg():
-                self._skip(info.size if info.type in (_GLOBAL, tarfile.GNUTYPE_LONGLINK) else 0)
+            if info.islnk() or info.issym():
+                yield Member(name, None, self.start, self._offset, link)
+            elif not info.isreg():
+                self._skip(info.size if info.type == _GLOBAL else 0)
             elif wanted(name) and size > limit:
                 self._skip(size)
                 what = f"the member {ascii(name)[:80]} has {size:,} bytes, more than the bound of {limit:,}"
@@ -152,16 +158,16 @@ class _TarReader:
 
 
 def _attributes(kind: bytes, data: bytes) -> dict[str, str]:
-    """Return name and size from a header about the next member; others are ignored."""
-    if kind == _LONG_NAME:
-        return {"path": data.rstrip(b"\0").decode("utf-8", "surrogateescape")}
+    """Return name, link and size from a header about the next member; others are ignored."""
+    if kind in (_LONG_NAME, _LONG_LINK):
+        return {"path" if kind == _LONG_NAME else "linkpath": data.rstrip(b"\0").decode("utf-8", "surrogateescape")}
     found = {}
     while data:
         length, space, _ = data.partition(b" ")
         if not space or not length.isdigit() or int(length) <= len(length) + 1:
             break
         key, _, value = data[len(length) + 1 : int(length)].rstrip(b"\n").partition(b"=")
-        if key == b"path" or (key == b"size" and value.isdigit()):
+        if key in (b"path", b"linkpath") or (key == b"size" and value.isdigit()):
             found[key.decode()] = value.decode("utf-8", "surrogateescape")
         data = data[int(length) :]
     return found

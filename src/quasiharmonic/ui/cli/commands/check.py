@@ -120,7 +120,8 @@ def _clean(mesh: MeshData, weld: bool | float) -> tuple[dict[str, Any], str]:
     except ValueError as error:  # All triangles are degenerate.
         return {}, f"{command} rejects the mesh: {error}"
     changes = {name: elements.tolist() for name, elements in cleaned.changes.items()}
-    return changes, f"{command} uses this mesh with these changes:\n{cleaned.tabulate_changes()}"
+    table = cleaned.tabulate_changes()
+    return changes, f"{command} uses this mesh " + (f"with these changes:\n{table}" if table else "without changes.")
 
 
 def _verify(

@@ -66,6 +66,11 @@ def run(options: argparse.Namespace) -> int:
         io.write_per_triangle(options.export, V, F, uv, values)
     facts = {**found.to_dict(), "triangles": len(mesh.F)}
     lines = [_table(found, len(mesh.F))]
+    if mesh.FT is None:
+        lines.append(
+            "The surface in the file is flat and equal to the map, so nothing is distorted. To measure the distortion "
+            "of the original surface, write the map as OBJ, PLY or glTF."
+        )
     if mirrored.size:
         lines.append(f"mirrored {names_of('island', 'islands', mirrored)} measured with reversed orientation")
     if found.distances is not None:

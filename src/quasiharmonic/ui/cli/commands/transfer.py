@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quasiharmonic.ui.cli import pipeline, report
-from quasiharmonic.ui.cli.arguments import add_options, choice, file, set_default
+from quasiharmonic.ui.cli.arguments import add_options, choice, file, flag, set_default
 
 if TYPE_CHECKING:
     import numpy as np
@@ -65,6 +65,10 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
             "triangle), or GIFTI data",
             **pair,
         ),
+        nearest=flag(
+            "for --values: take the value of the nearest corner instead of interpolating, for labels (default: for the "
+            "labels of .label.gii)"
+        ),
         per=choice(
             ("vertex", "triangle"), "for --values: whether rows belong to vertices or to triangles (default: vertex)"
         ),
@@ -94,6 +98,8 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.util.arrays import count_of
 
     set_default(options, "per", "vertex", asked=options.values is not None, belongs="--values")
+    if options.nearest and options.values is None:
+        raise ValueError("--nearest needs --values: add --values, or omit --nearest")
     outputs = _outputs(options)
     inputs = (options.source, options.target, *(pair[0] for pair in (options.values, options.landmarks) if pair))
     report.check_new(outputs, options.json, inputs=inputs)
@@ -199,7 +205,8 @@ def _values(options: argparse.Namespace, source: _MappedFile, between: SurfaceMa
         )
     if options.per == "vertex":
         values = values[source.origin]
-    out = between.transfer(values, per=options.per, outside=options.outside)
+    nearest = options.nearest or values.dtype.kind == "i"
+    out = between.transfer(values, per=options.per, outside=options.outside, nearest=nearest)
     out[~mark(len(between.source.V), between.source.F)] = float("nan")
     return out
 
@@ -227,8 +234,8 @@ def _landmarks(options: argparse.Namespace, source: _MappedFile, target: _Mapped
     return ("\n".join(lines) + "\n").encode()
 
 
-def _read_table(path: Path) -> NDArray[np.float64]:
-    """Read rows of numbers; NaN is allowed."""
+def _read_table(path: Path) -> NDArray[np.float64] | NDArray[np.int64]:
+    """Read rows of numbers, integers only if they are labels; NaN is allowed."""
     import numpy as np
 
     from quasiharmonic import io
