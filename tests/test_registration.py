@@ -295,3 +295,13 @@ def test_every_patch_of_moved_pixels_has_a_fold():
 
 def test_the_penalty_of_folds_has_correct_derivatives():
     assert check_energy(FoldPenalty(0.1, 0.4)).passed
+
+
+def test_a_field_far_from_zero_is_rejected_instead_of_reported_as_folded():
+    field = np.full((10, 10, 2), 1e12)
+    assert nearest_invertible(field).folds == 0
+    with pytest.raises(ValueError, match="subtract the mean displacement"):
+        nearest_invertible(100 * field)
+    # A large scale is no obstacle.
+    x, y = np.meshgrid(np.arange(10.0), np.arange(10.0))
+    assert nearest_invertible(1e9 * np.stack([x, y], axis=-1)).folds == 0
