@@ -286,8 +286,7 @@ def _bound_rounding(w: ComplexArray) -> float:
     error, side = 64 * float(np.finfo(np.float64).eps) * float(np.median(np.abs(w))), max(side, 1)
     if error >= side:
         raise ValueError(
-            "the displacements are so large that doubles do not resolve the cells: subtract the mean displacement from "
-            "the field, and add it to the result"
+            "the displacements are so large that doubles do not resolve the cells: subtract the mean displacement"
         )
     return error * side
 

@@ -85,8 +85,8 @@ def _solve_each(A: FloatArray, b: FloatArray) -> FloatArray:
     try:
         return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
     except np.linalg.LinAlgError:
-        # Differences of positions are rounded, so a very flat tetrahedron can have none but singular edges. Its image
-        # still contains the points at which the least-squares solution is exact.
+        # Differences of positions are rounded, so the edges of a very flat tetrahedron can be singular. It still
+        # contains the points at which the least-squares solution is exact.
         x = np.full(b.shape, np.nan)
         flat = np.linalg.det(A) == 0
         x[~flat] = np.linalg.solve(A[~flat], b[~flat][..., None])[..., 0]
