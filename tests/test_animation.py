@@ -367,3 +367,11 @@ def test_a_frame_without_a_map_is_not_written(backwards, head, tmp_path, capsys)
     assert "not of this run" not in capsys.readouterr().out
     assert run("animate", surface, *frames, "-o", tmp_path / "out") == 1
     assert "out: 0004.obj" in capsys.readouterr().out
+
+
+def test_repeated_targets_are_frames_of_the_callback(head):
+    V, F, loop = head
+    targets = turning_stars(len(loop), 8)[[0, 0, 1, 1]]
+    steps = []
+    animate(Problem(V, F, loop, targets[0]), targets, callback=steps.append)
+    assert [step.frame for step in steps] == [0, 1, 2, 3]

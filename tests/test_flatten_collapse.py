@@ -8,6 +8,7 @@ import pytest
 from quasiharmonic import Status, certify, distortion, find_cuts, flatten, inverted_triangles
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.multilevel import flatten_coarse
+from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.worst_triangles import has_collapsed, stretch_of_boundary, worst_stretch
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.atlas import flatten as flatten_atlas
@@ -99,6 +100,18 @@ def test_a_descent_that_does_not_end_is_replaced_by_another_start():
     assert result.status is Status.POLISHED
     assert worst(V, F, result.uv) < 5
     assert any(stage.name.startswith("start again") for stage in result.stages)
+
+
+@pytest.mark.parametrize("energy", ["symmetric-dirichlet", "mips"])
+def test_a_thin_planar_surface_is_its_own_map_even_if_scaling_makes_it_overlap(monkeypatch, energy):
+    V, F = disk(3)
+    V[:, 1] *= 1e-30
+    # Scaled maps are not bijective, as if rounding made the boundary meet itself.
+    monkeypatch.setattr(Piece, "fit_scale", lambda self, uv: uv * [-1, 0])
+    result = flatten(V, F, energy=energy)
+    assert result.status is Status.EXHAUSTED
+    assert result.certificate.bijective
+    assert np.ptp(result.uv[:, 0]) == np.ptp(V[:, 0])
 
 
 class Stuck(SymmetricDirichlet):

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Status, certify, distortion, find_cuts, flatten, is_injective
-from quasiharmonic.apps.flattening import free_boundary, initial_maps
+from quasiharmonic.apps.flattening import distance_descent, free_boundary, initial_maps
+from quasiharmonic.apps.flattening.coarse_distances import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.multilevel import Hierarchy, Level, descend_level, flatten_coarse, map_to_disk
+from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.worst_triangles import smooth_map, thick_energy
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.deformation import DeformationEnergy
@@ -18,6 +20,7 @@ from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
 from quasiharmonic.surfaces import annulus, cat, grid, random_delaunay, starfish
+from quasiharmonic.util.options import DistanceOptions
 
 
 def in_space(V):
@@ -229,3 +232,17 @@ def test_a_large_surface_with_limbs_does_not_collapse(linear_solver, rings, monk
     assert result.certificate.bijective
     assert result.status is Status.POLISHED
     assert distortion(V, F, result.uv).statistics("isometric").maximum < 10
+
+
+def test_an_interrupt_before_the_first_step_for_distances_leaves_a_recorded_map(monkeypatch):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(distance_descent, "descend", interrupted)
+    V, F = grid(24, 24)
+    piece = Piece(np.column_stack([V, 0.3 * np.sin(7 * V[:, 0])]), F)
+    options = DistanceOptions(rings=13, record_every=1)
+    found = lower_coarse_distance_error(piece, options, least=200)
+    assert found.status is Status.INTERRUPTED
+    assert found.certificate.bijective
+    assert [snapshot.iteration for snapshot in found.path] == [0]

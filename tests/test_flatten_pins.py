@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from quasiharmonic import Status, certify, flatten
+from quasiharmonic.apps.flattening import pin_search
 from quasiharmonic.apps.flattening.piece import Piece
-from quasiharmonic.apps.flattening.pin_search import PinSearch, move_onto_pins, pin_obstructions
-from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.apps.flattening.pin_obstructions import find_pin_obstructions, select_without_air
+from quasiharmonic.apps.flattening.pin_search import PinSearch, move_onto_pins
+from quasiharmonic.geometry.mesh.topology import boundary_loops, edges
+from quasiharmonic.problem.diagnosis import Diagnosis, Obstruction
 from quasiharmonic.results import Forbids, Kind
 from quasiharmonic.surfaces import annulus, cat, disk, grid, random_delaunay
 from quasiharmonic.util.options import FlattenOptions
@@ -198,7 +202,41 @@ def test_pins_of_an_existing_map_are_never_called_impossible():
     for seed in range(10):
         V, F = random_delaunay(120, seed)
         fixed = rng.choice(len(V), 60, replace=False)
-        assert not pin_obstructions(F, len(V), fixed, V[fixed]).obstructions
+        assert not find_pin_obstructions(F, len(V), fixed, V[fixed]).obstructions
+
+
+def test_obstructions_that_only_air_edges_cause_prove_nothing(monkeypatch):
+    V, F = disk(3)
+    sizes = []
+
+    def forbid(problem, **options):
+        """A solver that names an air edge in every diagnosis."""
+        air = edges(problem.domain.F, problem.n).interior[-1:]
+        assert air.max() >= len(V)
+        sizes.append(problem.n)
+        reason = Obstruction(Kind.CHORD, Forbids.INJECTIVE, "", split=air)
+        uv = np.zeros((problem.n, 2))
+        return SimpleNamespace(uv=uv, status=Status.IMPOSSIBLE, diagnosis=Diagnosis((reason,)), stages=[], history=[])
+
+    monkeypatch.setattr(pin_search, "solve", forbid)
+    # Two of three vertices change places, so that the free map does not fit.
+    result = flatten(V, F, fixed=[20, 26, 32], target=V[[20, 32, 26]])
+    assert result.status is Status.STALLED
+    assert result.diagnosis is None
+    # Both frames were tried, each with four further splits.
+    assert len(sizes) == 10
+    assert sizes[1:5] == [sizes[0] + k for k in range(1, 5)]
+
+
+@pytest.mark.parametrize("kind", Kind)
+def test_obstructions_by_the_boundary_need_air(kind):
+    F = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1]])
+    diagnosis = Diagnosis((Obstruction(kind, Forbids.INJECTIVE, "", vertices=[0]),))
+    local = {Kind.COLLAPSED_EDGE, Kind.INVERTED_TRIANGLE, Kind.INVERTED_PATCH, Kind.CHORD}
+    if_surrounded = {Kind.HALF_PLANES, Kind.HIDDEN}
+    assert (select_without_air(diagnosis, F, 4, np.array([1, 2])) is not None) == (kind in local)
+    assert (select_without_air(diagnosis, F, 4, np.array([1, 2, 3])) is not None) == (kind in local | if_surrounded)
+    assert select_without_air(diagnosis, F, 0, np.array([], dtype=int)) is None
 
 
 def test_malformed_input_is_rejected():

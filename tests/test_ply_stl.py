@@ -233,3 +233,14 @@ def test_a_signalling_nan_in_an_array_is_an_error_without_a_warning(kind, bits):
         repair(odd, F, V)
     # A position that is NaN is to be computed.
     assert np.isfinite(repair(V, F, odd).uv).all()
+
+
+@pytest.mark.parametrize("space", [b" ", b"\r", b"\r\n", b"\n"])
+@pytest.mark.parametrize("name", [b"a", b"facet", b""])
+def test_white_space_of_stl_text(space, name, tmp_path):
+    path = tmp_path / "two.stl"
+    second = FACET.replace(b"1 0 0", b"2 0 0").replace(b"facet normal 0 0 1", b"FACET\tNORMAL 0 0 1", 1)
+    path.write_bytes((b"solid " + name + b"\n" + FACET + second + b"endsolid " + name).replace(b"\n", space))
+    mesh = io.read_mesh(path)
+    assert len(mesh.F) == 2
+    assert mesh.V[:, 0].max() == 2

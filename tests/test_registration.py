@@ -153,8 +153,24 @@ def test_noise_with_a_large_offset_is_repaired_in_double_precision():
     assert not fold_free(field, spacing=0.1).all()
     mended = nearest_invertible(field, spacing=0.1, min_jacobian=0)
     assert fold_free(mended.field, spacing=0.1).all()
-    with pytest.raises(RuntimeError, match="rounding folds the new field"):
+    with pytest.raises(ValueError, match="subtract the mean displacement"):
         nearest_invertible(field + 1e16, spacing=0.1)
+
+
+@pytest.mark.slow
+def test_rounding_that_folds_a_part_far_from_zero_is_reported():
+    field = np.random.default_rng(3).normal(size=(14, 15, 2)) * 0.3
+    messages = []
+    # Where most pixels are near zero, the bound of rounding is small. Not every offset rounds to a fold.
+    for offset in np.linspace(1.3e13, 3.4e13, 12):
+        far = field.copy()
+        far[:, 8:] += offset
+        try:
+            assert nearest_invertible(far, spacing=0.1).success
+        except RuntimeError as error:
+            messages.append(str(error))
+    assert messages
+    assert all("rounding folds the new field" in message for message in messages)
 
 
 @pytest.mark.parametrize("far", [1e8, 1e200])
@@ -295,3 +311,13 @@ def test_every_patch_of_moved_pixels_has_a_fold():
 
 def test_the_penalty_of_folds_has_correct_derivatives():
     assert check_energy(FoldPenalty(0.1, 0.4)).passed
+
+
+def test_a_field_far_from_zero_is_rejected_instead_of_reported_as_folded():
+    field = np.full((10, 10, 2), 1e12)
+    assert nearest_invertible(field).folds == 0
+    with pytest.raises(ValueError, match="subtract the mean displacement"):
+        nearest_invertible(100 * field)
+    # A large scale is no obstacle.
+    x, y = np.meshgrid(np.arange(10.0), np.arange(10.0))
+    assert nearest_invertible(1e9 * np.stack([x, y], axis=-1)).folds == 0

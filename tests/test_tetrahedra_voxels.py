@@ -159,3 +159,17 @@ def test_the_scale_of_a_volume_does_not_matter(scale):
     assert scaled.distance == plain.distance * scale
     back = inverse_field(scaled.field, spacing=scale).field
     np.testing.assert_array_equal(back, inverse_field(plain.field).field * scale)
+
+
+def test_the_inverse_of_a_field_with_tetrahedra_that_rounding_makes_singular():
+    # The third coordinate rises by one unit in the last place, so all tetrahedra are positive. From the first voxel at
+    # -1, the rise at 0 is rounded away.
+    rise = np.array([[2.0**-52, 2.0**-53], [2.0**-53, 2.0**-52]])
+    base = np.array([[-1.0, 0.0], [0.0, 1.0]])
+    field = np.zeros((2, 2, 2, 3))
+    field[..., 2] = base, base + rise - 1
+    assert not find_folded_cells(VoxelGrid((2, 2, 2)), field, None).any()
+    back = inverse_field(field)
+    # Three voxels lie in the image, at positions of mapped voxels.
+    assert np.argwhere(~back.outside).tolist() == [[0, 0, 1], [0, 1, 0], [1, 1, 1]]
+    np.testing.assert_allclose(back.field[0, 0, 1], 0, atol=1e-9)

@@ -195,7 +195,7 @@ def _trace_rings(T: IntArray, chosen: BoolArray, degree: IntArray) -> Iterator[t
 
 
 def _rotate_to_apex(rings: IntArray, cost: FloatArray) -> IntArray:
-    """Rotate rings (d, r) so that they begin with the vertex of least burden."""
+    """Rotate rings (d, r) so that they begin with the vertex of least cost."""
     d, r = rings.shape
     turn = cost.take(rings).argmin(axis=0)
     return rings.take((turn + np.arange(d)[:, None]) % d * r + np.arange(r))

@@ -1,6 +1,7 @@
 """Find the nearest displacement field without folds.
 
-Folds of a field on voxels are those of its trilinear interpolation, as ITK and ANTs sample it.
+On pixels, a field is interpolated bilinearly. On voxels, it is affine on the six tetrahedra of each cell. `fold_free`
+can also examine the trilinear interpolation, as ITK and ANTs sample it.
 """
 
 from __future__ import annotations
@@ -156,8 +157,8 @@ def nearest_invertible(
         Distance between neighbouring pixels, along x, along y, and along z.
     min_jacobian : float
         Lower bound of the determinants at the four corners of each cell, or of the volume ratios of the six tetrahedra
-        of each cell of voxels; at least 0 and less than 1. Cells below it count as folds. Smaller values than the
-        rounding error of a determinant are raised to it. A field with determinants slightly above the bound stays
+        of each cell of voxels; at least 0 and less than 1. Cells with a value that is not above it count as folds. It
+        is at least the rounding error of a determinant. A field with determinants slightly above the bound stays
         without folds in single precision.
     fixed : (h, w) or (d, h, w) array of bool, optional
         Pixels that keep their displacements; none by default, so border pixels may also move.
@@ -171,7 +172,7 @@ def nearest_invertible(
     ------
     ValueError
         If an array has the wrong shape, the field is not finite, or an option is out of range. The message names the
-        pixels.
+        pixels. Also if the field is so far from zero that rounding errors are as large as cells.
     RuntimeError
         If no field was found, because of fixed pixels or because displacements are too large for the precision of
         doubles.
@@ -274,9 +275,20 @@ def is_fold_free(grid: PixelGrid, field: FloatArray) -> BoolArray:
 
 
 def _bound_rounding(w: ComplexArray) -> float:
-    """A bound on the rounding error of a determinant of a map (h, w), from medians, so that outliers do not count."""
+    """A bound on the rounding error of a determinant of a map (h, w), from medians, so that outliers do not count.
+
+    ValueError if it reaches the determinant of a normal cell.
+    """
     side = max(float(np.median(np.abs(np.diff(w, axis=axis)))) for axis in (0, 1))
-    return 64 * float(np.finfo(np.float64).eps) * float(np.median(np.abs(w))) * max(side, 1)
+    # Positions have errors of about eps |w|, and their differences of 2 eps |w|. A determinant has two products of two
+    # differences, so its error is about 8 eps |w| times a side. The rest, 8, is for positions and sides above the
+    # medians.
+    error, side = 64 * float(np.finfo(np.float64).eps) * float(np.median(np.abs(w))), max(side, 1)
+    if error >= side:
+        raise ValueError(
+            "the displacements are so large that doubles do not resolve the cells: subtract the mean displacement"
+        )
+    return error * side
 
 
 def _descend(grid: PixelGrid, given: ComplexArray, fixed: BoolArray, min_jacobian: float) -> ComplexArray:

@@ -65,11 +65,11 @@ def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
     X = (grid.positions(given) / grid.spacing).reshape(-1, 3)
     for tetrahedra, voxel, position in _candidates(grid, X):
         p = X[tetrahedra]
-        edges = np.moveaxis(p[:, 1:] - p[:, :1], 1, 2)
-        weights = np.linalg.solve(edges, (position - p[:, 0])[..., None])[..., 0]
+        weights = _solve_each(np.moveaxis(p[:, 1:] - p[:, :1], 1, 2), position - p[:, 0])
         weights = np.column_stack([1 - weights.sum(axis=1), weights])
         inside = weights.min(axis=1)
         good = np.flatnonzero(inside >= -_ROUNDING)
+        # If a voxel occurs several times, the last assignment, of the tetrahedron that it is deepest inside, holds.
         good = good[np.argsort(inside[good], kind="stable")]
         good = good[inside[good] > best[voxel[good]]]
         source = np.stack(np.unravel_index(tetrahedra[good], grid.shape), axis=-1)[..., ::-1]
@@ -78,6 +78,22 @@ def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
     back = np.ldexp(back * grid.spacing, exponent)
     outside = np.isnan(back[:, 0])
     return InverseVolume(back.reshape(given.shape), outside.reshape(grid.shape))
+
+
+def _solve_each(A: FloatArray, b: FloatArray) -> FloatArray:
+    """Solve linear systems (k, 3, 3) with right sides (k, 3); NaN for singular ones without a solution."""
+    try:
+        return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
+    except np.linalg.LinAlgError:
+        # Differences of positions are rounded, so the edges of a very flat tetrahedron can be singular. It still
+        # contains the points at which the least-squares solution is exact.
+        x = np.full(b.shape, np.nan)
+        flat = np.linalg.det(A) == 0
+        x[~flat] = np.linalg.solve(A[~flat], b[~flat][..., None])[..., 0]
+        least = (np.linalg.pinv(A[flat]) @ b[flat][..., None])[..., 0]
+        error = np.abs((A[flat] @ least[..., None])[..., 0] - b[flat]).max(axis=1, initial=0)
+        x[flat] = np.where(error[:, None] <= _ROUNDING, least, np.nan)
+        return x
 
 
 def _candidates(grid: VoxelGrid, X: FloatArray) -> Iterator[tuple[IntArray, IntArray, FloatArray]]:

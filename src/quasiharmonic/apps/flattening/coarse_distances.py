@@ -72,19 +72,25 @@ def lower_coarse_distance_error(piece: Piece, options: DistanceOptions, *, least
     # Smooth once more than other maps; on a cortex this lowers the mean error by 1 %.
     found = smooth_map(piece.V, piece.F, piece.loops, found, solver)
     if options.record_every:
-        run.path.append(Snapshot(run.history[-1].iteration, to_given_unit(found, piece.exponent)))
+        # An interrupt may have come before the first step was recorded.
+        run.path.append(Snapshot(max(len(run.history) - 1, 0), to_given_unit(found, piece.exponent)))
     return run.result(found, piece.F, status, loops=piece.loops, linear_solver=descent.linear_solver)
 
 
 def _measure_distances(hierarchy: Hierarchy, level: Level, rings: int) -> SurfaceDistances:
     """Distances between vertices of a level up to this number of the surface's rings, along the next finer mesh."""
+
+    def count_rings(along: Level) -> float:
+        """The same distance in rings of a level."""
+        return float(rings * np.sqrt(along.vertices.size / len(hierarchy.V)))
+
     finer = hierarchy.level(hierarchy.finer(level.stop))
-    if rings * np.sqrt(finer.vertices.size / len(hierarchy.V)) > _MAX_RINGS:
+    if count_rings(finer) > _MAX_RINGS:
         finer = level
     found = sample_distances(
         finer.V,
         finer.F,
-        choose_sampling(round(rings * np.sqrt(finer.vertices.size / len(hierarchy.V)))),
+        choose_sampling(round(count_rings(finer))),
         among=np.searchsorted(finer.vertices, level.vertices),
         lowest=LOWEST,
     )

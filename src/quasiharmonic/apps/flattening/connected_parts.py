@@ -9,13 +9,12 @@ import numpy as np
 
 from quasiharmonic.apps.flattening.piece import Piece, check_in_range
 from quasiharmonic.energies.deformation import signed_areas
-from quasiharmonic.geometry.mesh.topology import components
+from quasiharmonic.geometry.mesh.topology import components, group_by_label
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
     IntArray,
     check_range,
-    invert_indices,
     to_complex,
     to_points,
 )
@@ -53,17 +52,14 @@ def split_parts(V: FloatArray, F: IntArray, kept: BoolArray | None = None) -> li
         return [_make_part(V, F, np.flatnonzero(kept), everything[1])]
     if not label.any() or (kept is None and not used.all()):
         return [Part(Piece(V, F), *everything)]
-    of_triangle = label[F[:, 0]]
-    labels, count = np.unique(of_triangle, return_counts=True)
-    return [
-        _make_part(V, F, np.flatnonzero(label == own), np.flatnonzero(of_triangle == own))
-        for own in labels[np.argsort(-count, kind="stable")].tolist()
-    ]
+    # Both lists have the same order, because every used vertex has a triangle.
+    groups = zip(group_by_label(np.where(used, label, -1)), group_by_label(label[F[:, 0]]), strict=True)
+    return [_make_part(V, F, *own) for own in sorted(groups, key=lambda own: -len(own[1]))]
 
 
 def _make_part(V: FloatArray, F: IntArray, vertices: IntArray, triangles: IntArray) -> Part:
     try:
-        return Part(Piece(V[vertices], invert_indices(len(V), vertices)[F[triangles]]), vertices, triangles)
+        return Part(Piece(V[vertices], np.searchsorted(vertices, F[triangles])), vertices, triangles)
     except ValueError as error:
         raise ValueError(f"{name_part(vertices)}: {error}") from None
 

@@ -321,7 +321,10 @@ def choose_sampling(rings: int) -> Sampling:
 
 
 def fit_scale(uv: FloatArray, distances: SurfaceDistances, F: IntArray, loops: list[IntArray]) -> FloatArray:
-    """Scale a bijective map so that its distances fit the surface's best, and centre it at the origin."""
+    """Scale a bijective map so that its distances fit the surface's best, and centre it at the origin.
+
+    If rounding then inverts a triangle, only scale it, by a power of two.
+    """
     # First scale by a power of two, so that squared lengths neither overflow nor underflow.
     uv = np.ldexp(uv, -int(np.frexp(np.ptp(uv, axis=0).max())[1]))
     scale = distances.error(uv).scale

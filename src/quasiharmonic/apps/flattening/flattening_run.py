@@ -4,6 +4,9 @@ initial map ──▶ free descent ──▶ overlaps itself? ── no ──�
      ▲                                 │ yes                  ▲  │ yes
      │                          guarded descent ──────────────┘  │
      └────────────────── next initial map ◀──────────────────────┘
+
+Overlaps are first pulled apart. If that fails or distorts the map, the guarded descent follows. It also replaces the
+free descent from each initial map that is tried because of a collapse, once any free descent has ended with an overlap.
 """
 
 from __future__ import annotations
@@ -96,8 +99,11 @@ class Flattening:
         self._starts = list_initial_maps(piece, self._measure, options.linear_solver, lambda: self._solver)
         # The map so far.
         self._bijective: FloatArray | None = None
-        # Whether a free descent ended with an overlap, and its map, if it had converged.
+        # Whether any free descent has ended with an overlap. It is never cleared: an overlap is usually required by the
+        # surface, so a free descent from another initial map would end with one too.
         self._overlaps = False
+        # The map of the last such descent, if it had converged. It shows how much stretch the surface requires, so the
+        # maps from all later initial maps are compared with it.
         self._overlapping: FloatArray | None = None
 
     def run(self, start: FloatArray | None) -> MapResult:
@@ -108,24 +114,38 @@ class Flattening:
         status = Status.INTERRUPTED
         with self._run.until_interrupted():
             if (flat := self._piece.thin_planar_map()) is not None:
-                self._run_descent(self._piece.fit_scale(flat), guarded=False, near=True, max_iterations=0)
-                status = Status.EXHAUSTED
+                status = self._keep_planar(flat)
             else:
                 status = self._descend(start)
                 if self._has_collapsed(status):
                     status = self._restart(status)
         found = self._bijective
         if found is None:
+            assert self._run.interrupted
             raise KeyboardInterrupt
 
         def end() -> MapResult:
-            uv = self._piece.fit_scale(found) if self._measure.is_scale_free(in_units(found, 0)) else found
+            uv = self._fit_scale(found) if self._measure.is_scale_free(in_units(found, 0)) else found
             return self._run.result(uv, self._piece.F, status, loops=self._piece.loops, linear_solver=self._solver)
 
         return finish_result(end)
 
+    def _keep_planar(self, flat: FloatArray) -> Status:
+        """Use a planar surface as its own map, because rounding errors dominate the energies of its thin triangles."""
+        self._bijective = uv = self._fit_scale(flat)
+        self._solver = SurfaceDescent(self._measure, uv, self._wanted_solver, iterate=True).linear_solver
+        # The record has a stage, of no steps, as that of any other surface.
+        name, exponent = f"free descent, {self._options.energy_name}", self._piece.exponent
+        self._run.descend(name, (), lambda: self._energy(uv), lambda: to_given_unit(uv, exponent))
+        return Status.EXHAUSTED
+
+    def _fit_scale(self, uv: FloatArray) -> FloatArray:
+        """Scale a bijective map to the surface's area, unless rounding then makes its boundary meet itself."""
+        scaled = self._piece.fit_scale(uv)
+        return uv if self._rim.meets_itself(scaled) else scaled
+
     def _descend(self, start: FloatArray | None) -> Status:
-        """Descend with a free boundary; if the result overlaps itself, descend again with a guarded boundary."""
+        """Descend with a free boundary and, if `_run_descent` asks for it, again with a guarded boundary."""
         almost = self._find_almost_isometry() if start is None else None
         start = almost.uv if almost is not None else start
         if start is not None:
@@ -170,7 +190,7 @@ class Flattening:
         return own
 
     def _descend_free(self, own: InitialMap) -> Status | None:
-        """Descend from an initial map with a free boundary; return None if the result overlaps itself."""
+        """Descend from an initial map with a free boundary; return as `_run_descent`."""
         return self._run_descent(own.uv, guarded=False, near=own.energy < _TUNING.direct_energy)
 
     def _descend_guarded(self) -> Status:
@@ -250,14 +270,17 @@ class Flattening:
         guarded: bool,
         near: bool,
         rotations: RotationPath | None = None,
-        max_iterations: int | None = None,
     ) -> Status | None:
-        """Descend from a map, which must be bijective if ``guarded``; return None if the result overlaps itself."""
+        """Descend from a map, which must be bijective if ``guarded``.
+
+        Return None if a guarded descent must follow: the result overlaps itself, or its overlaps were pulled apart, but
+        this distorts it too much. In the first case `_bijective` is None if no bijective map is known yet; in the
+        second it is the distorted map.
+        """
         energy = self._measure if near else self._piece.energy(ReweightedDirichlet(), self._weights)
         rim = self._rim if guarded else None
         descent = SurfaceDescent(energy, uv, self._wanted_solver, rim=rim, iterate=True, rotations=rotations)
         self._solver = descent.linear_solver
-        most = self._options.max_iterations if max_iterations is None else max_iterations
         recent: deque[tuple[float, FloatArray]] = deque(maxlen=_TUNING.recent)
         name = f"{'guarded' if guarded else 'free'} descent, {self._options.energy_name}"
         exponent = self._piece.exponent
@@ -265,7 +288,7 @@ class Flattening:
         try:
             status = self._run.descend(
                 name,
-                self._take_steps(descent, most, recent, guarded=guarded),
+                self._take_steps(descent, recent, guarded=guarded),
                 lambda: self._measure.value(descent.w),
                 lambda: to_given_unit(descent.uv, exponent),
             )
@@ -274,22 +297,24 @@ class Flattening:
             found, interrupted = finish(lambda: self._use(descent, status, recent, guarded=guarded))
             if interrupted:
                 raise KeyboardInterrupt
-        if found is None or not found.pulled:
-            return None if found is None else status
+        if found is None:
+            return None
+        if not found.pulled:
+            return status
         before, after = self._measure.value(descent.w), self._energy(found.uv)
         self._run.add_stage("overlaps pulled apart", n_iterations=1, energy=(before, after))
         self._run.record(0, after, lambda: to_given_unit(found.uv, exponent))
-        # If the pulled triangles are distorted too much, a guarded descent continues from there.
+        # If the pulled triangles are distorted too much, a guarded descent continues from this map.
         return status if after <= _TUNING.max_pulled_ratio * before + _TUNING.least_pulled else None
 
     def _take_steps(
-        self, descent: SurfaceDescent, most: int, recent: deque[tuple[float, FloatArray]], *, guarded: bool
+        self, descent: SurfaceDescent, recent: deque[tuple[float, FloatArray]], *, guarded: bool
     ) -> Iterator[Status | None]:
         """Take the steps of a descent, with its last maps in ``recent``; stop if the free boundary is tangled."""
         patches = None if guarded else PatchDescents(self._measure, self._wanted_solver).improve
         course = descend(descent, self._density, self._options.tol, patches)
         last = np.inf
-        for number, outcome in enumerate(itertools.islice(course, most), 1):
+        for number, outcome in enumerate(itertools.islice(course, self._options.max_iterations), 1):
             energy = self._measure.value(descent.w)
             recent.append((energy, descent.uv))
             yield outcome

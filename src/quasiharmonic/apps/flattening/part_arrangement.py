@@ -19,7 +19,8 @@ import numpy as np
 
 from quasiharmonic.apps.flattening.connected_parts import Part, name_part, unite_parts
 from quasiharmonic.apps.flattening.contacts import nearest_on_edges
-from quasiharmonic.apps.flattening.pin_search import PinSearch, pin_obstructions
+from quasiharmonic.apps.flattening.pin_obstructions import find_pin_obstructions
+from quasiharmonic.apps.flattening.pin_search import PinSearch
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.loops import check_loops, winding
@@ -66,18 +67,17 @@ def flatten_pinned_parts(
     for part in parts:
         run = make_search(part)
         given = None if start is None else start[part.vertices]
-        with np.errstate(all="ignore"):
-            if results and results[-1].status is Status.INTERRUPTED:
-                # The other parts still need a position, so they are only flattened freely.
-                run.flatten_freely(given)
-                run.status = Status.INTERRUPTED
-            else:
-                run.run(given)
+        if results and results[-1].status is Status.INTERRUPTED:
+            # The other parts still need a position, so they are only flattened freely.
+            run.flatten_freely(given)
+            run.status = Status.INTERRUPTED
+        else:
+            run.run(given)
         results.append(run.result())
     union = unite_parts(parts)
     found = _combine(union, results)
     if not found.certificate.bijective and found.status is not Status.INTERRUPTED:
-        diagnosis = pin_obstructions(F, int(F.max()) + 1, fixed, target)
+        diagnosis = find_pin_obstructions(F, int(F.max()) + 1, fixed, target)
         failed = [k for k, result in enumerate(results) if not result.certificate.bijective]
         if diagnosis.forbids_bijective:
             found = replace(found, status=Status.IMPOSSIBLE, diagnosis=diagnosis)

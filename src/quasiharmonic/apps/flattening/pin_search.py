@@ -1,4 +1,4 @@
-"""Bijective maps with fixed vertices and an otherwise free boundary, and contradictions between target positions.
+"""Bijective maps with fixed vertices and an otherwise free boundary.
 
 ::
 
@@ -15,28 +15,24 @@ harmless.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.flattening.air_triangulation import triangulate_air
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.flattening_run import Flattening
 from quasiharmonic.apps.flattening.piece import Piece, to_given_unit
+from quasiharmonic.apps.flattening.pin_obstructions import find_pin_obstructions, select_without_air
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.polishing import find_energy
-from quasiharmonic.geometry.exact.box_pairs import box_pairs_between
 from quasiharmonic.geometry.exact.certificate import certify
-from quasiharmonic.geometry.exact.loops import contacts
-from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.splitting import split_edges
-from quasiharmonic.geometry.mesh.topology import Edges, edge_keys, edges, pair_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, edges, pair_keys
 from quasiharmonic.problem import Problem
-from quasiharmonic.problem.diagnosis import Diagnosis, Forbids, Kind, Obstruction
-from quasiharmonic.problem.diagnosis.conditions import find_inverted_fixed
+from quasiharmonic.problem.diagnosis import Diagnosis
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.problem.run import Run
 from quasiharmonic.solver.mapping import solve
@@ -45,11 +41,8 @@ from quasiharmonic.solver.search.stages import CoarseToFine, Stages, speed
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
-    edge_names,
     find_exponent,
     fixed_vertices,
-    mark,
-    names_of,
     target_positions,
     to_complex,
 )
@@ -128,6 +121,7 @@ def check_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, F
 _UNDECIDED = Status.INJECTIVE, Status.STALLED, Status.OUT_OF_ITERATIONS, Status.UNSOLVABLE
 
 
+# Its steps ignore overflow, which gives inf or NaN: comparisons with NaN are false, so such a map is never accepted.
 class PinSearch:
     """The search for a bijective map with some fixed vertices and an otherwise free boundary, with its record.
 
@@ -138,10 +132,19 @@ class PinSearch:
     else that of the search. Ctrl-C raises KeyboardInterrupt before there is any bijective map, with or without pins.
     ValueError if a rest triangle has no area.
 
+    `run` takes all steps for one surface. The steps can also be called one by one, and `result` ends each of these
+    sequences:
+
+    - ``run``
+    - ``flatten_freely``; then the caller sets ``status`` to ``INTERRUPTED``. This is for a surface that only needs a
+      position, because an earlier one was interrupted.
+    - ``keep`` of a map that is not bijective, ``find_bijective`` from one or more other maps, then ``lower_distortion``
+      if the certificate is bijective and the status is not ``INTERRUPTED``. This is for several surfaces.
+
     Attributes
     ----------
     certificate : Certificate
-        The certificate of the current map.
+        The certificate of the current map, which is NaN at first.
     status : Status
     exponent : int
         The map is in units of ``2 ** exponent``, normally the piece's unit. It differs if the extent of the pins
@@ -165,6 +168,8 @@ class PinSearch:
         self._target = np.ldexp(target, -self.exponent)
         self._energy = piece.energy(find_energy(options.energy), weights)
         self._solver = ""
+        self._uv = np.full((len(piece.V), 2), np.nan)
+        self.certificate = certify(piece.F, self._uv, loops=piece.loops)
         self.status = Status.STALLED
         self._diagnosis: Diagnosis | None = None
         self._run = Run(options.callback, options.record_every)
@@ -179,14 +184,13 @@ class PinSearch:
 
         ``start`` (n, 2) is an injective map at any scale and position.
         """
-        # Overflow gives inf or NaN. Comparisons with NaN are false, so such a step is never accepted.
-        with np.errstate(all="ignore"):
-            moved = self.flatten_freely(start)
-            if not self.certificate.bijective and self.status is not Status.INTERRUPTED:
-                self.find_bijective(moved)
-            if self.certificate.bijective and self.status is not Status.INTERRUPTED:
-                self.lower_distortion()
+        moved = self.flatten_freely(start)
+        if not self.certificate.bijective and self.status is not Status.INTERRUPTED:
+            self.find_bijective(moved)
+        if self.certificate.bijective and self.status is not Status.INTERRUPTED:
+            self.lower_distortion()
 
+    @np.errstate(all="ignore")
     def flatten_freely(self, start: FloatArray | None) -> FloatArray:
         """Flatten freely, optionally from a start in the surface's unit, and move the map onto the pins; (n, 2)."""
         piece = self._piece
@@ -201,10 +205,14 @@ class PinSearch:
         self.keep(moved)
         return moved
 
+    @np.errstate(all="ignore")
     def find_bijective(self, moved: FloatArray) -> None:
-        """Find a bijective map with the target positions, from a bijective map (n, 2) without them."""
+        """Find a bijective map with the target positions, from a bijective map (n, 2) without them.
+
+        The result is kept if it is bijective or has fewer wrong triangles than the current map.
+        """
         piece = self._piece
-        diagnosis = pin_obstructions(piece.F, len(piece.V), self._fixed, self._target)
+        diagnosis = find_pin_obstructions(piece.F, len(piece.V), self._fixed, self._target)
         if diagnosis.forbids_bijective:
             self.status, self._diagnosis = Status.IMPOSSIBLE, diagnosis
             return
@@ -258,9 +266,12 @@ class PinSearch:
                 return
             split = self._select_air_edges(found.diagnosis.split)
             if not len(split):
-                self._diagnosis = self._select_obstructions(found.diagnosis)
+                self._diagnosis = select_without_air(found.diagnosis, piece.F, n, self._fixed)
                 self.status = Status.STALLED if self._diagnosis is None else Status.IMPOSSIBLE
                 return
+        else:
+            # Further air edges could be split, so nothing is proven.
+            self.status = Status.STALLED
 
     def _select_air_edges(self, pairs: IntArray) -> IntArray:
         """Return the edges that belong to no triangle of the surface."""
@@ -269,25 +280,7 @@ class PinSearch:
         own = edge_keys(F.ravel(), np.roll(F, -1, axis=1).ravel(), n)
         return pairs[~np.isin(pair_keys(pairs, n), own)]
 
-    def _select_obstructions(self, diagnosis: Diagnosis) -> Diagnosis | None:
-        """Return the obstructions that do not involve air or frame; None if there are none."""
-        n, F = len(self._piece.V), self._piece.F
-        held = mark(n, self._fixed)
-        own = []
-        for obstruction in diagnosis.obstructions:
-            vertices = np.concatenate([obstruction.vertices, obstruction.edges.ravel()])
-            if vertices.max(initial=-1) >= n or obstruction.triangles.max(initial=-1) >= len(F):
-                continue
-            if obstruction.kind in (Kind.HALF_PLANES, Kind.HIDDEN):
-                # If not all neighbours of a vertex are fixed, it may have a valid position outside the frame.
-                around = np.setdiff1d(F[np.isin(F, vertices[:1]).any(axis=1)], vertices[:1])
-                if not held[around].all():
-                    continue
-            elif obstruction.kind not in (Kind.COLLAPSED_EDGE, Kind.INVERTED_TRIANGLE, Kind.INVERTED_PATCH, Kind.CHORD):
-                continue
-            own.append(obstruction)
-        return Diagnosis(tuple(own), diagnosis.unchecked) if own else None
-
+    @np.errstate(all="ignore")
     def lower_distortion(self) -> None:
         """Lower the distortion of a bijective map with only the pins fixed."""
         options = self._options
@@ -328,83 +321,3 @@ class PinSearch:
         )
         undecided = result.injective and not result.certificate.bijective and self.status in _UNDECIDED
         return replace(result, status=Status.INJECTIVE) if undecided else result
-
-
-def pin_obstructions(F: IntArray, n: int, fixed: IntArray, target: FloatArray) -> Diagnosis:
-    """Find contradictions between the target positions (k, 2) of fixed vertices (k,), each given once.
-
-    The triangles have ``n`` vertices. The diagnosis reports vertices with the same target position, triangles of three
-    fixed vertices that are not counterclockwise, edges between two fixed vertices that intersect others or a fixed
-    vertex, and fixed vertices inside triangles of others. Each contradiction forbids a bijective map with any boundary.
-    An empty diagnosis proves nothing.
-    """
-    found, is_fixed = edges(F, n), mark(n, fixed)
-    where = np.zeros((n, 2))
-    where[fixed] = target
-    obstructions = [
-        *_find_shared_positions(fixed, target),
-        *_find_inverted(F, is_fixed, where, found),
-        *_find_crossings(is_fixed, where, found, fixed),
-        *_find_covered(F, is_fixed, where, fixed),
-    ]
-    return Diagnosis(tuple(obstructions), ("the boundary, because it is free",))
-
-
-def _find_shared_positions(fixed: IntArray, target: FloatArray) -> Iterator[Obstruction]:
-    order = np.lexsort((fixed, target[:, 1], target[:, 0]))
-    placed = target[order]
-    first = np.flatnonzero(np.concatenate([[True], (placed[1:] != placed[:-1]).any(axis=1)]))
-    for group in np.split(fixed[order], first[1:]):
-        if group.size > 1:
-            message = f"{names_of('Vertex', 'Vertices', group)} are fixed at the same position."
-            yield Obstruction(Kind.PIN, Forbids.BIJECTIVE, message, vertices=group)
-
-
-def _find_inverted(F: IntArray, is_fixed: NDArray[np.bool_], where: FloatArray, found: Edges) -> Iterator[Obstruction]:
-    for t, abc, s, split in find_inverted_fixed(F, is_fixed, where, found.boundary):
-        message = (
-            f"All vertices of {names_of('triangle', 'triangles', t)} are fixed, "
-            f"and their targets {'invert' if s < 0 else 'flatten'} it."
-        )
-        yield Obstruction(Kind.INVERTED_TRIANGLE, Forbids.INJECTIVE, message, vertices=abc, triangles=t, split=split)
-
-
-def _find_crossings(
-    is_fixed: NDArray[np.bool_], where: FloatArray, found: Edges, fixed: IntArray
-) -> Iterator[Obstruction]:
-    """Edges between fixed vertices that intersect other such edges or other fixed vertices."""
-    inner, outer = (pairs[is_fixed[pairs].all(axis=1)] for pairs in (found.interior, found.boundary))
-    segments = np.concatenate([inner, outer, np.stack([fixed, fixed], axis=1)])
-    joined = len(inner) + len(outer)
-    if not joined:
-        return
-    # Maximum number of intersecting pairs that are named.
-    max_pairs = 100
-    pairs = contacts(where, segments, max_pairs).pairs
-    # Vertices with the same position are reported by `_find_shared_positions`, so edges of length zero are omitted.
-    apart = (where[segments[:, 0]] != where[segments[:, 1]]).any(axis=1) | (np.arange(len(segments)) >= joined)
-    for i, j in pairs[(pairs[:, 0] < joined) & apart[pairs].all(axis=1)].tolist():
-        ends = segments[[i, j]]
-        other = edge_names(ends[1:]) if j < joined else names_of("vertex", "vertices", ends[1, :1])
-        message = f"Both ends of {edge_names(ends[:1])} are fixed, and the segment between them meets {other}."
-        split = ends[[k < len(inner) for k in (i, j)]]
-        kind = Kind.CHORD if len(split) else Kind.CROSSING
-        edges_ = ends if j < joined else ends[:1]
-        yield Obstruction(kind, Forbids.BIJECTIVE, message, vertices=np.unique(ends), edges=edges_, split=split)
-
-
-def _find_covered(
-    F: IntArray, is_fixed: NDArray[np.bool_], where: FloatArray, fixed: IntArray
-) -> Iterator[Obstruction]:
-    """Fixed vertices inside a triangle of other fixed vertices."""
-    fixed_triangles = np.flatnonzero(is_fixed[F].all(axis=1))
-    corners = where[F[fixed_triangles]]
-    positions = where[fixed]
-    for i, j in box_pairs_between(corners.min(axis=1), corners.max(axis=1), positions, positions):
-        sign = [orientation(corners[i, k], corners[i, k - 2], positions[j]) for k in range(3)]
-        inside = (np.minimum.reduce(sign) > 0).nonzero()[0]
-        for t, pin in zip(fixed_triangles[i[inside]].tolist(), fixed[j[inside]].tolist(), strict=True):
-            message = f"Vertex {pin} is fixed inside triangle {t}, whose vertices are all fixed as well."
-            yield Obstruction(
-                Kind.PIN, Forbids.BIJECTIVE, message, vertices=np.array([pin, *F[t]]), triangles=np.array([t])
-            )

@@ -67,6 +67,7 @@ class FrameSearch:
             for t, target in enumerate(self._targets):
                 if before is not None and np.array_equal(target, self._targets[before]):
                     self.frames.append(self.frames[before])
+                    self.report(t, 0, move)
                     continue
                 frame = self.search(target, last, None if before is None else self._targets[before])
                 self.frames.append(frame)

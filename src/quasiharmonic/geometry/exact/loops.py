@@ -50,6 +50,7 @@ class Obstacle(StrEnum):
     INTERSECTION = "intersection"
     WINDING = "winding"
     NESTING = "nesting"
+    # As the field of `Certificate`. The value is part of reports since 0.2.0.
     MULTIPLY_WOUND = "multiply_wound"
 
 

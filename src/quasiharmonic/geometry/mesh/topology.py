@@ -184,7 +184,8 @@ def are_collapsed(F: IntArray) -> BoolArray:
 def find_twins(F: IntArray) -> IntArray:
     """Return for each triangle (f, 3) the first one with the same three vertices, in any order."""
     twin = np.arange(len(F))
-    # The sum of hashed vertices does not depend on their order. Only triangles with equal sums are compared.
+    # The sum of hashed vertices does not depend on their order. Only triangles with equal sums are compared. The hash
+    # uses the increment and the first multiplier of SplitMix64 (Steele, Lea and Flood 2014).
     hashed = np.arange(int(F.max(initial=-1)) + 1, dtype=np.uint64)
     for shift in (np.uint64(31), np.uint64(29)):
         hashed += np.uint64(0x9E3779B97F4A7C15)

@@ -18,7 +18,8 @@ _HEADER = 84
 # Loops of three vertices, separated by any white space.
 _NUMBER = rb"\s+([-+.0-9eE]+)"
 _LOOP = re.compile(rb"outer\s+loop" + 3 * (rb"\s+vertex" + 3 * _NUMBER) + rb"\s+endloop\s+endfacet", re.IGNORECASE)
-_FACET_WORD = re.compile(rb"^\s*facet\s", re.IGNORECASE | re.MULTILINE)
+# Names of solids may contain the word "facet" alone.
+_FACET_START = re.compile(rb"(?<!\S)facet\s+(?:normal|outer)\s", re.IGNORECASE)
 
 
 def read_stl(path: str | os.PathLike[str]) -> MeshData:
@@ -66,7 +67,7 @@ def _read_text(data: bytes) -> FloatArray | None:
     if data[:512].lstrip()[:5].lower() != b"solid" or b"endsolid" not in data.lower():
         return None
     facets = _LOOP.findall(data)
-    if len(facets) != len(_FACET_WORD.findall(data)):
+    if len(facets) != len(_FACET_START.findall(data)):
         return None
     try:
         return np.array([list(map(float, facet)) for facet in facets], dtype=np.float64).reshape(-1, 3, 3)

@@ -85,17 +85,36 @@ class Polygon:
                     reached.append(child)
 
     def link_distance(self, start: int, goal: int, limit: int) -> int:
-        """Return the smallest number of segments of a path between two corners, at most ``limit + 1``."""
+        """Return the smallest number of segments of a path between two corners, at most ``limit + 1``.
+
+        After each segment, a path may be anywhere on the *window*, a segment across the polygon or at first a point.
+        The shortest paths to the goal from both ends of the window join at the *bend*::
+
+            before ●─__       ▓▓▓▓▓▓▓▓▓   ● after
+                   │   ‾‾──__  ▓▓▓▓▓▓▓   ╱
+            window │         ‾‾──__▓▓▓  ╱ __──    next window: from the bend to the right,
+                   │         __──‾‾ ● ──‾‾        on the line from other
+            other  ●─ __──‾‾     bend
+
+        ``before`` and ``other`` precede the bend on the two paths; here they are the ends. All lines from the window
+        through the bend lie between the two lines from them. The one that has turned further towards ``after`` is a
+        limit: no segment from the window reaches a point behind it. So its part from the bend to the boundary is the
+        next window.
+        """
         window = [(self._points[start], self._triangle_at[start])]
         for count in range(1, limit + 1):
             heartbeat()
             paths = [self._shortest_path(point, t, goal) for point, t in window]
             common = _common_end(paths)
-            if common == 1 or any(len(path) == common for path in paths):
+            if common == 1:
                 return count  # The paths meet only at the goal, so a point of the window sees it.
+            # Both paths have a point before the bend: no end of a window is a bend of the other end's path, because a
+            # path bends at reflex corners only, and the part of the polygon behind the window is convex at both ends.
+            # At the bend, the wall is on the side of `after`; at the other end, the line leaves the polygon.
             bend, after = paths[0][-common], paths[0][1 - common]
-            # Of all lines from the window past the bend, take the one that has turned furthest.
             before, other = paths[0][-common - 1], paths[-1][-common - 1]
+            # If the line through the bend turns from `before` to `other` as the path turns at the bend, the line from
+            # `other` has turned further.
             if _turn(bend, before, other) == _turn(before, bend, after):
                 before = other
             window = [(bend, self._triangle_at[self._corner[bend]]), self._extend_ray(before, bend)]
@@ -254,10 +273,14 @@ class Shortcuts:
         free, place = fixture.joined[:, 0], invert_indices(problem.n, self._loop)[fixture.joined[:, 1]]
         free, place = free[place >= 0], place[place >= 0]
         both = np.concatenate([fixture.inner, fixture.inner[:, ::-1]])
+        # Free vertex × free vertex: 1 for each edge.
         self._inner = csr_array((np.ones(len(both)), both.T), shape=(problem.n, problem.n))
+        # Place of a boundary vertex in the loop × free vertex: 1 for each edge.
         self._ends = csr_array((np.ones(len(free)), (place, free)), shape=(len(self._loop), problem.n))
         self._fixture = fixture
+        # The angles of the target at its corners: a segment starts inside if it starts between two sides.
         self._corners = corners
+        # The sides of the target, by their vertices (m, 2); segments must not meet them.
         self._sides = np.stack([self._loop, np.roll(self._loop, -1)], axis=1)
         self._polygon = Polygon(fixture.points(self._loop))
         self.unchecked = LONGEST + 1
@@ -266,6 +289,8 @@ class Shortcuts:
         """Yield obstructions of vertex pairs with fewer edges than segments between them, nearest pairs first."""
         n = len(self._loop)
         budget = self._WORK + self._WORK_PER_VERTEX * n
+        # Place × free vertex: 1 if at most k - 1 edges join them, all but the first between free vertices. With a last
+        # edge to the boundary, these are paths of at most k edges between two places.
         reached, known = self._ends, np.empty(0, dtype=np.int64)
         at_ends = np.bincount(self._ends.indices, minlength=self._ends.shape[1])
         for k in range(2, LONGEST + 1):
@@ -279,8 +304,8 @@ class Shortcuts:
             reached = reached @ self._inner + reached
             reached.data[:] = 1
             i, j = np.divmod(keys, n)
-            # A path along the boundary needs no more segments than edges, or two for a single edge. `Sight` checks
-            # neighbours of a common vertex.
+            # A path along the boundary needs no more segments than edges, or two for a single edge. Pairs at two edges
+            # have a common free neighbour; `conditions.Sight` checks whether it has a position that sees both.
             far = (np.minimum((i - j) % n, (j - i) % n) > k) & (k > 2)
             i, j = i[far], j[far]
             if not i.size:
@@ -303,6 +328,9 @@ class Shortcuts:
         where = self._fixture.positions
         p, q = where[tails], where[heads]
         result = self._clear(tails, heads, p, q)
+        # Pairs that see each other, in both orders, as sorted keys. So the corners that one corner sees are successive,
+        # and the nearest on either side of a third corner are the two keys beside that of the pair. Neighbours across
+        # the start of the loop are missed, which only leaves more pairs to check.
         seen = np.sort(np.concatenate([(i * n + j)[result], (j * n + i)[result]]))
         for here, there in ((i, j), (j, i)) if seen.size else ():
             at = np.searchsorted(seen, here * n + there)
