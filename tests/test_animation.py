@@ -260,7 +260,11 @@ def test_interrupted_with_the_finished_frames(head, sweep):
     assert len(animation.frames) == (6 if sweep == 0 else 12)
     assert animation.found.all()
     assert animation.interrupted
-    assert "interrupted" in animation.summary()
+    missing = ("the last frame", "the moves between frames were limited")[sweep]
+    assert f"interrupted before {missing}" in animation.summary()
+    over = animation.largest_move > 1.2
+    assert ("beyond the limit of 1.2" in animation.summary()) == over
+    assert over or sweep == 0
 
 
 def test_one_frame():

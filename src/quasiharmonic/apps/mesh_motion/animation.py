@@ -244,7 +244,10 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
         if not found.all():
             lines[0] += "; change the targets of the others, or use fill_gaps=True"
         if self.interrupted:
-            lines.append("interrupted before the last frame")
+            smoothed = np.isfinite(self.energies).any()
+            lines.append(
+                f"interrupted before {'the moves between frames were limited' if smoothed else 'the last frame'}"
+            )
         if self.bridged.any():
             lines.append(f"between their neighbours: {names_of('frame', 'frames', np.flatnonzero(self.bridged))}")
         overlapping = np.flatnonzero(found & ~self.bijective)
@@ -257,7 +260,9 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
         more = int(np.count_nonzero(~found)) - 5
         if more > 0:
             lines.append(f"and {count_of('frame', 'frames', more)} more without a map")
-        lines.append(f"no vertex moves more than {self.largest_move:.3g} times as far as the boundary")
+        over = self.max_motion_ratio is not None and self.largest_move > self.max_motion_ratio
+        beyond = f", beyond the limit of {self.max_motion_ratio:g}" if over else ""
+        lines.append(f"no vertex moves more than {self.largest_move:.3g} times as far as the boundary{beyond}")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
