@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import hard_models as models
 from quasiharmonic import unwrap
+from shared.boundaries import torus
 from shared.examples import examples
 from shared.hinges import (
     count_flat_faces,
@@ -281,11 +282,18 @@ def test_a_ring_whose_ends_touch_is_one_chart():
     assert (result.n_charts, result.success) == (1, True)
 
 
+@pytest.mark.parametrize("around", [12, 24, 48])
+def test_rings_of_a_torus_with_twelve_sides_stay_together(around):
+    result = unwrap(*torus(around, 12))
+    assert result.success
+    assert result.n_charts <= 4
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [5, 11, 40])
 def test_moebius_bands_are_cut_open(n):
     V, F = models.twisted_band(n)
-    result = unwrap(V, F, resolution=256)
+    result = unwrap(V, F, resolution=256, packing_loss=0.1)
     assert result.success
     assert result.n_charts <= n + 1
     assert np.count_nonzero(edges_of(V, F, result.indices).seam) <= n + 1

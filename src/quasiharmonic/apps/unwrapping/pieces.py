@@ -23,8 +23,9 @@ from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at
 from quasiharmonic.util.progress import heartbeat
 
-#: Edges with a larger angle between the normals are creases. Those of a cylinder with twelve sides, 30°, are not.
-CREASE = np.deg2rad(30.01)
+#: Edges with a larger angle between the normals are creases. Those of tubes and tori with twelve sides, up to 31°, are
+#: not, those of tubes with eleven sides, 32.7°, are.
+CREASE = np.deg2rad(32.0)
 
 
 class PieceTuning(NamedTuple):
