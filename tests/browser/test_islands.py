@@ -155,7 +155,7 @@ def test_the_only_island_is_mirrored_and_reflected_again(address, opened, settle
 
 def test_energies_have_few_digits(address, opened):
     page = opened(address)
-    for energy, words in [(7.735e-12, "7.74e-12"), (0, "0"), (0.12345, "0.1235"), (2e7, "2.00e+7")]:
+    for energy, words in [(7.7351e-12, "7.74e-12"), (0, "0"), (0.12345, "0.1235"), (2e7, "2.00e+7")]:
         page.evaluate("energy => studio.panel.status.map({ ...studio.panel.status.header, energy }, true, 0)", energy)
         assert page.inner_text("#energy") == words
 
