@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from quasiharmonic import atlas, io, unwrap
-from quasiharmonic.surfaces import cat, grid, starfish
+from quasiharmonic.surfaces import cat, disk, grid, starfish
 from shared.pages import Visitor
 
 
@@ -83,6 +85,59 @@ def test_mirrored_islands_are_measured_as_their_reflection(tmp_path):
     for name in ("worst", "energy", "scale", "injective", "bijective", "flips"):
         assert mirrored.last("map").header[name] == plain.last("map").header[name]
     assert mirrored.last("map").header["worst"] == pytest.approx(1)
+
+
+def test_the_only_island_is_reflected_again_after_it_was_mirrored(tmp_path, monkeypatch):
+    (V, F), inner = disk(4), 0
+    one = opened(tmp_path, io.MeshData(V, F, vt=V, FT=F))
+    one.does("pin", vertex=inner)
+    one.does("place", to=[0, 0], mirror=True)
+    shown = one.last("map").header
+    assert (shown["injective"], shown["mirrored"]) == (False, True)
+    refused = {"pack": {}, "polish": {"energy": "mips"}, "pin": {"vertex": inner}, "grab": {"vertex": inner}}
+    for what, words in refused.items():
+        assert "the map is mirrored: press Mirror or Repair" in one.does(what, **words)[-1].header["text"]
+    mirrored = places(one)
+    one.does("repair")
+    shown = one.last("map").header
+    assert (shown["bijective"], shown["mirrored"]) == (True, False)
+    assert shown["pins"] == [inner]
+    assert places(one) == pytest.approx(V[F])
+    monkeypatch.chdir(tmp_path)
+    for name, content in one.files().items():
+        (tmp_path / name).write_bytes(content)
+    names = {}
+    exec(shown["python"], names)
+    assert np.array_equal(names["mesh"].uv[names["mesh"].FT], places(one))
+    one.does("undo")
+    assert np.array_equal(places(one), mirrored)
+    one.does("place", to=[0, 0], mirror=True)
+    assert one.last("map").header["bijective"]
+
+
+def test_a_reversed_boundary_is_mirrored_before_it_is_repaired(tmp_path):
+    V, F = disk(4)
+    uv = V * [-1, 1]
+    uv[0] = 0.9, 0.0
+    one = opened(tmp_path, io.MeshData(V, F, vt=uv, FT=F))
+    assert not one.last("map").header["mirrored"]
+    one.does("repair")
+    (found,) = one.last("obstructions").header["obstructions"]
+    assert found["advice"] == "Mirror the island, then press Repair."
+    one.does("place", to=[0, 0], mirror=True)
+    one.does("repair")
+    assert one.last("map").header["bijective"]
+
+
+def test_stitching_mirrored_islands_asks_for_a_reflection(tmp_path):
+    mesh = two_squares(shift=(5.0, 0.0))
+    one = opened(tmp_path, replace(mesh, vt=mesh.vt * [-1, 1]))
+    vertex = int(np.flatnonzero(mesh.V[:, 0] == mesh.V[:, 0].mean())[0])
+    assert "select all islands and press Mirror first" in one.does("stitch", vertex=vertex)[-1].header["text"]
+    one.does("place", to=[0, 0], mirror=True)
+    one.does("stitch", vertex=vertex)
+    assert one.last("map").header["bijective"]
+    assert one.last("map").header["count"] == 1
 
 
 def test_islands_are_scaled_mirrored_and_snapped(tmp_path):

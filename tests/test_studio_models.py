@@ -42,6 +42,12 @@ def test_a_boundary_of_three_vertices_opens(visitor):
     assert visitor.session.state.result.certificate.bijective
 
 
+def test_a_file_with_a_long_name_opens(visitor):
+    content, name = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 1\nf 1 2 3\nf 4 3 2\n", "a" * 196 + ".obj"
+    visitor.does("load", {"content": np.frombuffer(content, np.uint8)}, name=f"folder/{name}"[-200:])
+    assert visitor.session.state.sheet.name == name
+
+
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [

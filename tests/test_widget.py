@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Problem, boundary_loops, certify, injective_map, solve
+from quasiharmonic.atlas import SeamedMesh, as_seamed_mesh
 from quasiharmonic.io import MeshData, checkerboard, own_texture, read_mesh, write_map
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui import notebook
@@ -129,6 +130,8 @@ def test_a_model_of_several_parts(cell):
         widget.unwrap(max_stretch=-1)
     with pytest.raises(ValueError, match="a list of numbers below 2"):
         widget.select([7])
+    with pytest.raises(ValueError, match="islands must contain integer indices"):
+        widget.select([0.9])
 
 
 def test_image_selection_and_file_of_the_view(cell, tmp_path):
@@ -175,6 +178,31 @@ def test_every_kind_of_surface(cell, tmp_path):
     assert cell.show(V.tolist(), F.tolist()).result.injective
     pins = Problem(V, F, [*LOOP, 0], [*PROBLEM.target, [0.1, 0.1]])
     assert cell.show(pins).result.uv[0].tolist() == [0.1, 0.1]
+
+
+def test_a_mesh_object_keeps_its_map(cell, tmp_path):
+    right = V[F].mean(axis=1)[:, :1] > 0
+    two = MeshData(V, F, vt=np.concatenate([V, V + 3.0]), FT=F + len(V) * right)
+    for mesh in (two, as_seamed_mesh(two)):
+        shown = cell.show(mesh).mesh
+        assert len(shown.islands) == 2
+        np.testing.assert_array_equal(shown.uv[shown.FT], two.vt[two.FT])
+    with pytest.raises(ValueError, match=r"two\.off: OFF cannot store more than one pair"):
+        cell.widget.save(tmp_path / "two.off")
+    assert cell.show(SeamedMesh(V, F)).result.injective
+    # The second component has no texture coordinates.
+    G = np.concatenate([F, F + len(V)])
+    partly = MeshData(np.concatenate([V, V + 9]), G, vt=V, FT=np.where(len(V) > G, G, -1))
+    shown = cell.show(as_seamed_mesh(partly)).mesh
+    np.testing.assert_array_equal(shown.uv[shown.FT[: len(F)]], V[F])
+
+
+def test_a_mesh_of_trimesh_keeps_its_map(cell):
+    trimesh = pytest.importorskip("trimesh")
+    places, visual = np.pad(V, [(0, 0), (0, 1)]), trimesh.visual.TextureVisuals(uv=2 * V)
+    shown = cell.show(trimesh.Trimesh(places, F, process=False, visual=visual)).result
+    np.testing.assert_array_equal(shown.uv, 2 * V)
+    assert cell.show(trimesh.Trimesh(places, F, process=False)).result.injective
 
 
 @pytest.mark.parametrize(

@@ -119,6 +119,47 @@ def test_islands_are_scaled_mirrored_snapped_and_welded_by_buttons(halves, opene
     assert "closer than a texel" in page.inner_text("#note-text")
 
 
+def test_an_error_disappears_after_the_next_action_that_succeeds(halves, opened, settled):
+    page = opened(halves["sound"])
+    page.click("#weld")
+    page.wait_for_selector("#note:not([hidden])")
+    act(page, settled, lambda: page.locator("#islands button").first.click())
+    assert page.is_hidden("#note")
+
+
+def test_empty_and_long_fields(halves, opened, settled):
+    page = opened(halves["sound"])
+    page.click("summary")
+    page.fill("#padding", "")
+    act(page, settled, lambda: page.click("#pack"))
+    assert "--padding 4" in page.inner_text("#command")
+    page.select_option("#shape", "letter")
+    for typed, kept in [("AB", "A"), ("\U0001d538", "\U0001d538"), ("e\u0301", "é"), (" ", "")]:
+        page.fill("#letter", typed)
+        assert page.input_value("#letter") == kept
+    page.click("#outline button")
+    page.wait_for_selector("#note:not([hidden])")
+    assert page.inner_text("#note-text") == "Type a letter first."
+
+
+def test_the_only_island_is_mirrored_and_reflected_again(address, opened, settled):
+    page = opened(address)
+    energy = page.inner_text("#energy")
+    act(page, settled, lambda: page.click("#mirror"))
+    assert page.inner_text("#title") == "Mirrored"
+    assert "Mirror or Repair reflects the map" in page.inner_text("#words")
+    act(page, settled, lambda: page.click("#repair"))
+    assert "no inverted triangle" in page.inner_text("#verdict")
+    assert page.inner_text("#energy") == energy
+
+
+def test_energies_have_few_digits(address, opened):
+    page = opened(address)
+    for energy, words in [(7.7351e-12, "7.74e-12"), (0, "0"), (0.12345, "0.1235"), (2e7, "2.00e+7")]:
+        page.evaluate("energy => studio.panel.status.map({ ...studio.panel.status.header, energy }, true, 0)", energy)
+        assert page.inner_text("#energy") == words
+
+
 def test_stitch_joins_the_islands_at_a_seam(halves, opened, settled):
     page = opened(halves["sound"])
     page.keyboard.press("t")

@@ -11,7 +11,7 @@ import numpy as np
 
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import MeshFileError, report_damage
-from quasiharmonic.io.models.mesh_maps import in_plane
+from quasiharmonic.io.models.mesh_maps import in_plane, vertex_places
 from quasiharmonic.io.models.meshdata import MeshData, polygon_mesh
 from quasiharmonic.io.untrusted import (
     content_lines,
@@ -22,7 +22,7 @@ from quasiharmonic.io.untrusted import (
     quote_token,
     read_text,
 )
-from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.arrays import FloatArray, IntArray, vertex_names
 
 # Texture coordinates, colours and normals follow the coordinates, so the reader can skip them.
 _HEADER = re.compile(rb"(?:ST)?C?N?OFF")
@@ -95,6 +95,9 @@ def write_off(path: str | os.PathLike[str], mesh: MeshData) -> None:
 
 def write_off_map(path: str | os.PathLike[str], mesh: MeshData) -> None:
     """Write the map of a mesh as a mesh in the plane; raise `MeshFileError` if it has seams, which OFF cannot store."""
+    if mesh.FT is not None and (seam := vertex_places(mesh)[1]).any():
+        what = f"OFF cannot store more than one pair of texture coordinates for {vertex_names(np.flatnonzero(seam))}"
+        raise MeshFileError(path, what, remedy="write OBJ or PLY")
     write_off(path, in_plane(mesh))
 
 

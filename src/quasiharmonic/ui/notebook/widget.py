@@ -22,7 +22,7 @@ from quasiharmonic.ui.studio.protocol import Array, MessageFrame, ProtocolError,
 from quasiharmonic.ui.studio.saved_files import mapped_model, write_model
 from quasiharmonic.ui.studio.session import Session
 from quasiharmonic.ui.studio.surface import PageSurface, make_sheet, read_sheet
-from quasiharmonic.util.arrays import IntArray, describe
+from quasiharmonic.util.arrays import IntArray, describe, index_array
 from quasiharmonic.util.hints import explain_missing
 
 with explain_missing("the widget needs anywidget", extra="notebook"):
@@ -43,7 +43,7 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
     ----------
     surface : Problem, MapResult, (n, 2) or (n, 3) array, mesh or path
         A problem, a result, or a surface. A result keeps its boundary. A surface without a map starts with its boundary
-        on a square; a file with a map keeps its boundary. A model of several parts, or with defects, is unwrapped.
+        on a square; a file or a mesh with a map keeps its map. A model of several parts, or with defects, is unwrapped.
     F : (f, 3) array of int, optional
         Triangles, if ``surface`` is an array of positions.
     height : int
@@ -115,7 +115,7 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
 
     def select(self, islands: Sequence[int]) -> None:
         """Select islands, to which the other methods apply; raise ValueError if one does not exist."""
-        self._ask({"do": "select", "islands": [int(k) for k in islands]})
+        self._ask({"do": "select", "islands": index_array("islands", list(islands)).tolist()})
 
     def unwrap(self, *, max_stretch: float = 1.5, resolution: int = 2048, padding: float = 4) -> None:
         """Unwrap the whole model, as `quasiharmonic.unwrap` does; raise ValueError if that is not possible."""
@@ -221,6 +221,20 @@ def _sheet(surface: Any, F: ArrayLike | None) -> PageSurface:
         return make_sheet(MeshData(surface.V, surface.F).with_map(surface.uv), "result")
     if isinstance(surface, str | PathLike):
         return read_sheet(Path(fspath(surface)))
+    if isinstance(surface, MeshData):
+        return make_sheet(surface, "mesh")
+    if isinstance(surface, SeamedMesh):
+        return make_sheet(_mesh_data(surface), "mesh")
     if stands_for_mesh(surface):
-        return make_sheet(MeshData(*mesh_arrays(surface)), "mesh")
+        mesh = MeshData(*mesh_arrays(surface))
+        own_map = getattr(getattr(surface, "visual", None), "uv", None)  # The map of a mesh of trimesh
+        return make_sheet(mesh if own_map is None else mesh.with_map(own_map), "mesh")
     raise ValueError(f"{describe(surface)} is not a surface: pass V and F, a mesh, a path, a Problem or a MapResult")
+
+
+def _mesh_data(mesh: SeamedMesh) -> MeshData:
+    """Return a mesh with its map; triangles without finite positions have no texture coordinates."""
+    if mesh.uv is None:
+        return MeshData(mesh.V, mesh.F)
+    bare = np.asarray(np.isnan(mesh.uv).any(axis=1))
+    return MeshData(mesh.V, mesh.F, vt=np.nan_to_num(mesh.uv), FT=np.where(bare[mesh.FT], -1, mesh.FT))

@@ -92,7 +92,7 @@ def weld_seams(state: SessionState, distance: float) -> SessionState:
 def _join(state: SessionState, places: FloatArray, pairs: IntArray) -> SessionState:
     """Return the state with the map ``places`` (n, 2), changed so that pairs (k, 2) of vertices of the page coincide.
 
-    RequestError if the state was injective and the new map is not.
+    RequestError if the state was injective and the new map is not, or has one island, which is mirrored.
     """
     label = label_components(pairs[:, 0], pairs[:, 1], len(places))
     count = np.bincount(label, minlength=len(places))
@@ -101,6 +101,8 @@ def _join(state: SessionState, places: FloatArray, pairs: IntArray) -> SessionSt
     places[joined] = (middle[label] / count[label][:, None])[joined]
     mesh = state.mesh.with_places(np.split(places, state.numbering.starts[1:-1]))
     after = rebuild_from_mesh(state, mesh, record_start(mesh))
+    if state.injective and after.is_mirrored:
+        raise RequestError("joined there, the only island would be mirrored: select all islands and press Mirror first")
     if state.injective and not after.injective:
         bad = sum(len(one.result.certificate.inverted) for one in after.islands if one.result is not None)
         raise RequestError(f"joined there, {bad} triangles would be inverted: erase the seam and press Unwrap")

@@ -13,7 +13,7 @@ import numpy as np
 
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.exact.certificate import Certificate
-from quasiharmonic.problem.diagnosis.obstruction import Kind
+from quasiharmonic.problem.diagnosis.obstruction import Kind, Obstruction
 from quasiharmonic.ui.studio.drag import DragMap
 from quasiharmonic.ui.studio.protocol import Array
 from quasiharmonic.ui.studio.seams import find_seams, find_sides
@@ -128,7 +128,7 @@ def describe_obstructions(state: SessionState) -> list[dict[str, Any]]:
             found.append(
                 {
                     "message": each.message,
-                    "advice": each.advice,
+                    "advice": _advise(each),
                     "forbids": each.forbids.value,
                     "vertices": (each.vertices + start).tolist()[: _LIMITS.elements],
                     "edges": (edges.reshape(-1, 2) + start).tolist()[: _LIMITS.elements],
@@ -141,6 +141,11 @@ def describe_obstructions(state: SessionState) -> list[dict[str, Any]]:
         what = {"message": f"It was dragged across {across}.", "advice": "Drag it back.", "undo": True}
         return [found[0] | what]
     return found[: _LIMITS.obstructions]
+
+
+def _advise(each: Obstruction) -> str:
+    """Return advice for a user of the page."""
+    return "Mirror the island, then press Repair." if each.kind is Kind.REVERSED else each.advice
 
 
 def _around(loops: list[Array]) -> list[list[int]]:
@@ -220,7 +225,7 @@ def map_message(
     certificates = [one.result.certificate for one in state.islands if one.result is not None]
     uv = places = state.uv
     if dragged is None:
-        header = _describe_certificates(certificates, len(state.overlapping))
+        header = _describe_certificates(certificates, len(state.overlapping)) | {"mirrored": state.is_mirrored}
     else:
         k, shown = dragged
         uv = uv.copy()

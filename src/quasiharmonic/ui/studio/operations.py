@@ -250,9 +250,12 @@ def _list_pins(state: SessionState, islands: Sequence[int]) -> Given | None:
 
 
 def repair_islands(state: SessionState, callback: Callback = None) -> SessionState:
-    """Make inverted triangles positive; boundaries, pins, and all vertices that need not move keep their positions."""
+    """Make inverted triangles positive; boundaries, pins, and all vertices that need not move keep their positions.
+
+    If the only island is mirrored, it is reflected.
+    """
     source, mesh = find_source(state, with_map=True), state.mesh
-    options = {"fixed": _list_pins(state, range(len(state.islands)))}
+    options = {"fixed": _list_pins(state, range(len(state.islands))), "unmirror": state.is_mirrored}
     assert mesh.uv is not None
     result = repair(mesh.V, mesh.F, mesh.uv, FT=mesh.FT, callback=callback, **recipes.values(options))
     script = Script()
@@ -406,9 +409,16 @@ def require_map(state: SessionState) -> None:
         raise RequestError("there is no map yet: press Unwrap or Flatten first")
 
 
+def require_not_mirrored(state: SessionState) -> None:
+    """Raise RequestError if the only island is mirrored."""
+    if state.is_mirrored:
+        raise RequestError("the map is mirrored: press Mirror or Repair, which reflect it")
+
+
 def require_injective(state: SessionState) -> None:
     """Raise RequestError if the map of a selected island has inverted triangles."""
     require_map(state)
+    require_not_mirrored(state)
     bad = [k for k in state.selected if not state.islands[k].injective]
     if bad:
         which = "the map has" if len(state.islands) == 1 else f"island {bad[0]} has"

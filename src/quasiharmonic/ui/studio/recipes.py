@@ -199,4 +199,4 @@ def saved_rows(name: str, option: str, rows: IntArray) -> Given:
     table = rows if rows.ndim == 2 else rows[:, None]
     content = "".join(" ".join(map(str, row)) + "\n" for row in table.tolist()).encode()
     code = public(np.loadtxt)(name, dtype=np.int64)
-    return Given(rows, code.reshape(-1, 2) if rows.ndim == 2 else code, {option: name}, {name: content})
+    return Given(rows, code.reshape(-1, 2) if rows.ndim == 2 else code.reshape(-1), {option: name}, {name: content})

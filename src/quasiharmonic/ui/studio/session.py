@@ -31,7 +31,7 @@ from quasiharmonic.io.models.textures import texture_of
 from quasiharmonic.ui.studio import operations, validation
 from quasiharmonic.ui.studio.drag import Follower, drag_weights
 from quasiharmonic.ui.studio.islands import move_islands, pack_all, stitch_seam, weld_seams
-from quasiharmonic.ui.studio.operations import require_injective, require_map
+from quasiharmonic.ui.studio.operations import require_injective, require_map, require_not_mirrored
 from quasiharmonic.ui.studio.protocol import MessageFrame
 from quasiharmonic.ui.studio.saved_files import list_files
 from quasiharmonic.ui.studio.seams import draw_seam, erase_seam
@@ -276,6 +276,7 @@ class Session(PageUpdates):
     @Operation(changed_seams=True)
     def _do_pin(self, frame: MessageFrame) -> Plan:
         k, vertex = self._find(frame)
+        require_not_mirrored(self.state)
         one = self.state.islands[k]
         if any(vertex in loop for loop in one.loops):
             raise RequestError("that vertex is on the boundary, which is already fixed: drag it in the map")
@@ -301,6 +302,7 @@ class Session(PageUpdates):
         one = self.state.islands[k]
         if one.result is None:
             raise RequestError("there is no map to drag yet: press Unwrap or Flatten first")
+        require_not_mirrored(self.state)
         if self.state.selected != (k,):
             self._history.change(replace(self.state, selected=(k,)))
         problem = one.problem

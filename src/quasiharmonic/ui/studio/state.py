@@ -59,6 +59,14 @@ class SessionState:
         return all(one.injective for one in self.islands)
 
     @property
+    def is_mirrored(self) -> bool:
+        """Whether the only island is mirrored: all its triangles are inverted. Of several islands this is False."""
+        if len(self.islands) > 1 or self.active.result is None:
+            return False
+        certificate = self.active.result.certificate
+        return len(certificate.inverted) == certificate.triangles
+
+    @property
     def in_place(self) -> bool:
         """Whether the fixed vertices of the map are at their target positions."""
         return all(one.in_place for one in self.islands)

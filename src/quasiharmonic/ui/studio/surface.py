@@ -131,7 +131,7 @@ def read_upload(name: str, content: bytes) -> PageSurface:
 
     ValueError if the file is not a valid model. The message names the user's file, not a path of this machine.
     """
-    shown = PurePosixPath(name.replace("\\", "/")).name[:100]
+    shown = PurePosixPath(name.replace("\\", "/")).name
     # A page uploads one file, without further files that it may refer to.
     suffix = io.find_format(shown, "read", "single_file").suffix
     with stored_file(f"dropped{suffix}", content) as path:

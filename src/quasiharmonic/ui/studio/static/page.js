@@ -63,7 +63,10 @@ class Page {
     else if (header.kind === "busy") this.panel.status.busy(header.what);
     else if (header.kind === "progress") this.panel.status.progress(header);
     else if (header.kind === "saved") this.panel.unsaved = false;
-    else if (header.kind === "file") this.download(header.name, new Blob([arrays.content]));
+    else if (header.kind === "file") {
+      this.panel.status.forget();
+      this.download(header.name, new Blob([arrays.content]));
+    }
     else this.view.receive(frame);
     if (header.kind === "surface") {
       this.film.clear();
@@ -104,7 +107,7 @@ class Page {
     const suffix = file.name.toLowerCase().split(".").pop();
     const what = { svg: "drawing", png: "image", jpg: "image", jpeg: "image" }[suffix] ?? "load";
     if (what === "load") this.panel.status.forget();
-    this.send({ do: what, name: file.name.slice(-150) }, { content });
+    this.send({ do: what, name: file.name.slice(-200) }, { content });
   }
 
   download(name, blob) {

@@ -24,10 +24,12 @@ export class Panel {
     }
     for (const id of ["edges", "seams", "grid"]) $(id).addEventListener("change", () => view.set({ [id]: $(id).checked }));
     $("shape").addEventListener("change", () => ($("letter").hidden = $("shape").value !== "letter"));
+    $("letter").addEventListener("input", (event) => event.isComposing || this.#letter());
     $("outline").addEventListener("submit", (event) => {
       event.preventDefault();
       const shape = $("shape").value;
-      if (shape) send({ do: "outline", to: shape === "letter" ? `letter:${$("letter").value.trim()}` : shape });
+      if (shape === "letter" && !this.#letter()) this.status.note("Type a letter first.");
+      else if (shape) send({ do: "outline", to: shape === "letter" ? `letter:${this.#letter()}` : shape });
     });
     for (const id of ["undo", "redo", "flatten", "save", "stop", "turn", "repair"]) $(id).addEventListener("click", () => send({ do: id }));
     $("unwrap").addEventListener("click", () => this.unwrap());
@@ -76,8 +78,15 @@ export class Panel {
     }
   }
 
+  /** Shorten the field of the letter to one character, which may have two code units, and return it. */
+  #letter() {
+    return ($("letter").value = [...$("letter").value.trim().normalize("NFC")][0] ?? "");
+  }
+
   #size() {
-    return { resolution: Number($("resolution").value), padding: Number($("padding").value) };
+    const padding = $("padding").value;
+    // An empty field means the default.
+    return { resolution: Number($("resolution").value), ...(padding && { padding: Number(padding) }) };
   }
 
   unwrap() {

@@ -23,7 +23,8 @@ const PHASES = {
 const NUMBER = new Intl.NumberFormat("en", { maximumSignificantDigits: 4 });
 const shown = (value) => {
   if (value === null || value === undefined) return "∞";
-  return Math.abs(value) < 1e6 ? NUMBER.format(value) : value.toExponential(2);
+  const size = Math.abs(value);
+  return size === 0 || (size >= 1e-3 && size < 1e6) ? NUMBER.format(value) : value.toExponential(2);
 };
 
 export class Status {
@@ -42,6 +43,7 @@ export class Status {
   map(header, moved, rate) {
     if (header.state === "settled") {
       this.header = header;
+      this.forget();
       $("progress").hidden = true;
       clearInterval(this.ticking);
       $("elapsed").textContent = "";
@@ -55,7 +57,8 @@ export class Status {
       this.#verdict("open", "…", "No map without overlap yet", "Release the pointer to search for one, or undo.");
       return;
     }
-    if (!header.injective) this.#verdict("bad", "✗", "Not injective", header.verdict);
+    if (header.mirrored) this.#verdict("bad", "✗", "Mirrored", "Every triangle of the map is inverted. Mirror or Repair reflects the map.");
+    else if (!header.injective) this.#verdict("bad", "✗", "Not injective", header.verdict);
     else if (!header.reached) {
       this.#verdict("open", "…", "Target not reached", "The map is certified, but its boundary has not reached the dashed target.");
     } else if (header.bijective) this.#verdict("good", "✓", "Certified: no inverted triangle, no overlap", header.verdict);
@@ -136,7 +139,7 @@ export class Status {
     } else $("words").textContent = header.flips ? `${header.flips} triangles still inverted` : `energy ${shown(header.energy)}`;
   }
 
-  /** Show an error, until it is closed or something else happens. */
+  /** Show an error, until it is closed, or the next action starts a computation, changes the state or sends files. */
   note(text) {
     // A message that begins with a word, and not with a name, is a sentence.
     $("note-text").textContent = text.replace(/^[a-z]+(?=[ ,])/, (word) => word[0].toUpperCase() + word.slice(1));
