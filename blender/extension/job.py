@@ -10,6 +10,7 @@ from typing import Any
 
 import bpy
 
+from .advice import translate_advice
 from .surface import Refused
 
 # Seconds between two checks of a thread.
@@ -168,7 +169,7 @@ class Working(bpy.types.Operator):
             try:
                 return act(context)
             except (Refused, ValueError, ImportError) as error:
-                self.report({"ERROR"}, f"{self.bl_label}: {' '.join(str(error).split())}")
+                self.report({"ERROR"}, f"{self.bl_label}: {translate_advice(' '.join(str(error).split()))}")
             except Exception as error:
                 # An error of the extension. The traceback goes to the console.
                 traceback.print_exc()

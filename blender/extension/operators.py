@@ -24,6 +24,7 @@ from quasiharmonic.util.arrays import IntArray, count_of
 from quasiharmonic.util.options import ENERGY_LABELS, PolishOptions
 
 from . import outline, pins, surface
+from .advice import translate_advice
 from .job import Work, Working, find_objects
 from .surface import Refused
 
@@ -66,6 +67,8 @@ class UvWorking(Working):
         """Return the mesh objects to work on, the active one first; of objects that share a mesh the first."""
         found: list[bpy.types.Object] = []
         for thing in find_objects(context, self.mode, self.edited):
+            if thing == context.active_object:
+                surface.require_local(thing)
             if thing == context.active_object or (len(thing.data.polygons) and thing.data.library is None):
                 found += [] if any(other.data == thing.data for other in found) else [thing]
         return found
@@ -86,8 +89,8 @@ class UvWorking(Working):
     def take(self, mapped: SeamedMesh, remark: str = "") -> None:
         """Write a map to Blender and report the verdict of the map as stored there."""
         stored = surface.write(self.data, self.surface, mapped)
-        verdict = atlas.certify(stored)
-        lost = np.setdiff1d(verdict.inverted, atlas.certify(mapped).inverted)
+        verdict = surface.certify(stored)
+        lost = np.setdiff1d(verdict.inverted, surface.certify(mapped).inverted)
         if lost.size:
             remark = (
                 f"{count_of('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision. "
@@ -115,7 +118,7 @@ class QHM_OT_check(UvWorking):
         mesh, polygons = self.read_map(), self.surface.polygons
 
         def work(reports_progress: Callable[[Step], None]) -> tuple[AtlasVerdict, IntArray, IntArray]:
-            verdict = atlas.certify(mesh)
+            verdict = surface.certify(mesh)
             return verdict, _lying(mesh, verdict), _bent(mesh, polygons, verdict)
 
         return work
@@ -152,15 +155,21 @@ class QHM_OT_repair(ChosenWorking):
         """Return the work that repairs the map."""
         mesh = self.read_map(whole=self.whole)
         unmirror, fixed = self.unmirror, pins.list_pinned(self.surface)
-        return lambda reports_progress: repair(
-            mesh.V, mesh.F, mesh.uv, FT=mesh.FT, fixed=fixed, unmirror=unmirror, callback=reports_progress
-        )
+
+        def work(reports_progress: Callable[[Step], None]) -> tuple[SeamedMesh, str]:
+            if not unmirror and surface.reflect_single(mesh) is not mesh:
+                return mesh, ""
+            result = repair(
+                mesh.V, mesh.F, mesh.uv, FT=mesh.FT, fixed=fixed, unmirror=unmirror, callback=reports_progress
+            )
+            reasons = " ".join(island.reason for island in result.islands if island.reason)
+            return result.mesh, f"{translate_advice(reasons)} " if reasons else ""
+
+        return work
 
     def finish_one(self, context: bpy.types.Context, result: Any) -> None:
         """Write the map and report the result."""
-        mesh = self.surface.mesh
-        reasons = " ".join(island.reason for island in result.islands if island.reason)
-        self.take(SeamedMesh(mesh.V, mesh.F, result.FT, result.uv), f"{reasons} " if reasons else "")
+        self.take(*result)
 
 
 class QHM_OT_flatten(ChosenWorking):
@@ -187,8 +196,7 @@ class QHM_OT_flatten(ChosenWorking):
             opened = mesh
             if len(seams):
                 opened = seam_cuts.cut_along(mesh, seams, polygons=polygons)
-            elif 1 < len(polygons) == len(mesh.islands):
-                # A new UV layer of Blender looks the same: every face fills the square.
+            elif here.blank:
                 opened = SeamedMesh(mesh.V, mesh.F)
             opened = surface.restrict(opened, here.shown) if whole else here.choose(opened)
             if cut:
@@ -246,7 +254,7 @@ class QHM_OT_fit(ChosenWorking):
         ],
     )
     height: bpy.props.FloatProperty(name="Height", default=1.0, min=0.01, max=100.0)  # type: ignore[valid-type]
-    letter: bpy.props.StringProperty(name="Letter", default="G", maxlen=1)  # type: ignore[valid-type]
+    letter: bpy.props.StringProperty(name="Letter", default="G")  # type: ignore[valid-type]
     curve: bpy.props.StringProperty(name="Curve", description="Name of the object")  # type: ignore[valid-type]
 
     def find_objects(self, context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -256,11 +264,14 @@ class QHM_OT_fit(ChosenWorking):
 
     def prepare_one(self, context: bpy.types.Context) -> Work:
         """Return the work that fits the boundary to the outline, with corners detected, and computes the map."""
-        mesh = self.read(whole=self.whole)
+        mesh, here = self.read(), self.surface
+        if here.blank:
+            mesh = SeamedMesh(mesh.V, mesh.F)
+        mesh = surface.restrict(mesh, here.shown) if self.whole or self.mode != "EDIT" else here.choose(mesh)
         if len(mesh.islands) != 1:
             raise Refused(f"there are {len(mesh.islands)} islands: in edit mode, select faces of the one to fit only")
         _require_borders(mesh)
-        here, contours = self.surface, self._contours(context)
+        contours = self._contours(context)
         corners = CornerSpec("auto") if self.to == "RECTANGLE" else None
 
         def find(island: Island, reports_progress: Callable[[Step], None]) -> MapResult:
@@ -302,8 +313,11 @@ def _require_borders(mesh: SeamedMesh) -> None:
 
 
 def _told(verdict: AtlasVerdict) -> str:
-    """Return the first lines of a verdict, joined into one line."""
-    return " ".join(verdict.summary().splitlines()[:3])
+    """Return the first lines of a verdict, joined into one line, and how to turn mirrored islands over."""
+    told = " ".join(verdict.summary().splitlines()[:3])
+    if verdict.mirrored.size:
+        told += f" {QHM_OT_repair.bl_label} has the option Turn mirrored islands over."
+    return told
 
 
 def _describe_others(here: surface.Surface, stored: SeamedMesh) -> str:

@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 
 from quasiharmonic import targets
+from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 from .surface import Refused, numbers
@@ -30,18 +31,26 @@ def of_letter(letter: str) -> list[FloatArray]:
     Raises
     ------
     Refused
-        If the letter is blank.
+        If there is not exactly one letter, or its outline has several pieces or meets itself.
     """
-    if not letter.strip():
-        raise Refused("name a letter")
+    if len(letter.strip()) != 1:
+        raise Refused("name a letter, and only one")
     text = bpy.data.curves.new("qhm letter", type="FONT")
-    text.body = letter
+    text.body = letter.strip()
     thing = bpy.data.objects.new("qhm letter", text)
+    remedy = "choose another letter, or a text object in another font as curve"
     try:
-        return of_object(thing)
+        contours = of_object(thing)
+    except ValueError as error:
+        raise Refused(f"the outline of {text.body!r} in Blender's font is not valid: {remedy}. {error}") from None
     finally:
         bpy.data.objects.remove(thing)
         bpy.data.curves.remove(text)
+    # Holes run clockwise.
+    pieces = sum(targets.signed_area(contour) > 0 for contour in contours)
+    if pieces > 1:
+        raise Refused(f"{letter.strip()!r} is in {pieces} separate pieces in Blender's font: {remedy}")
+    return contours
 
 
 def of_named(context: bpy.types.Context, name: str) -> list[FloatArray]:
@@ -83,7 +92,7 @@ def of_object(thing: bpy.types.Object) -> list[FloatArray]:
     # A filled curve has duplicate points where its faces meet its outline.
     unit = np.ptp(points, axis=0).max() * _SAME or 1.0
     _, first, same = np.unique((points / unit).round(), axis=0, return_index=True, return_inverse=True)
-    found = [points[first][ring] for ring in _rings(same.ravel()[ends])]
+    found = [_drop_spikes(points[first][ring]) for ring in _rings(same.ravel()[ends])]
     if not found:
         raise Refused(f"{thing.name} has no closed outline: choose a closed curve")
     return _in_unit_square(targets.nested(found))
@@ -93,6 +102,18 @@ def _in_unit_square(contours: list[FloatArray]) -> list[FloatArray]:
     every = np.concatenate(contours)
     low, size = every.min(axis=0), np.ptp(every, axis=0).max()
     return [(contour - low) / size for contour in contours]
+
+
+def _drop_spikes(contour: FloatArray) -> FloatArray:
+    """Return a contour (k, 2) without points at which it turns back onto itself; Blender's letter Q has one."""
+    while len(contour) > 3:
+        before, after = (np.roll(contour, step, axis=0) for step in (1, -1))
+        back = ((before - contour) * (after - contour)).sum(axis=1) > 0
+        spikes = np.flatnonzero(back & (orientation(before, contour, after) == 0))
+        if not spikes.size:
+            break
+        contour = np.delete(contour, spikes[0], axis=0)
+    return contour
 
 
 def _rings(ends: IntArray) -> list[list[int]]:

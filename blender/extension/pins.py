@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from quasiharmonic.apps.atlas.atlas_verdict import MIRROR
 from quasiharmonic.apps.atlas.mapped_atlas import each_island, fit_in_place
 from quasiharmonic.apps.flattening.connected_parts import place_in_row
 from quasiharmonic.apps.flattening.free_boundary import flatten
@@ -19,7 +20,7 @@ from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray
 from quasiharmonic.util.options import PolishOptions
 
-from .surface import Refused, Surface
+from .surface import Refused, Surface, reflect_single
 
 Report = Callable[[Any], None]
 
@@ -144,7 +145,9 @@ def reduce_stretch(
         result = _complete(flatten(island.V, island.F, start=island.uv, energy=energy, callback=reports_progress))
         return replace(result, uv=fit_in_place(island, result.uv))
 
-    return each_island(mesh, lower).mesh
+    upright = reflect_single(mesh)
+    lowered = each_island(upright, lower).mesh
+    return lowered if upright is mesh else SeamedMesh(lowered.V, lowered.F, lowered.FT, lowered.uv * MIRROR)
 
 
 def hold_pins(problem: Problem, fixed: IntArray, target: FloatArray) -> Problem:

@@ -9,6 +9,9 @@ from typing import Any
 import bpy
 import numpy as np
 
+from quasiharmonic import atlas
+from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, is_mirrored
+from quasiharmonic.atlas import AtlasVerdict
 from quasiharmonic.geometry.mesh.polygons import Polygons
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
@@ -50,6 +53,12 @@ class Surface:
     pinned: BoolArray
     shown: BoolArray
     selected: BoolArray
+
+    @property
+    def blank(self) -> bool:
+        """Whether every visible face is an island, as in a new UV layer, where every face fills the square."""
+        faces = np.unique(self.polygons.of_triangle[self.mesh.mapped])
+        return len(faces) == len(self.mesh.islands) > 1
 
     def choose(self, mesh: SeamedMesh) -> SeamedMesh:
         """Return a mesh of the same triangles with the visible islands that have a selected triangle.
@@ -127,6 +136,31 @@ def require_map(surface: Surface) -> None:
     """Raise `Refused` if the mesh has no UV layer."""
     if surface.mesh.uv is None:
         raise Refused("the mesh has no UV map: flatten it first")
+
+
+def require_local(thing: bpy.types.Object) -> None:
+    """Raise `Refused` if the mesh of an object is linked from another file."""
+    if thing.data.library is not None:
+        raise Refused(f"{thing.name} is linked from another file, so its mesh cannot be changed: make it local")
+
+
+def reflect_single(mesh: SeamedMesh) -> SeamedMesh:
+    """Return the reflection of a map with a single island that is mirrored, and any other map as it is."""
+    if len(mesh.islands) == 1 and is_mirrored(mesh.islands[0].F, mesh.islands[0].uv):
+        return SeamedMesh(mesh.V, mesh.F, mesh.FT, mesh.uv * MIRROR)
+    return mesh
+
+
+def certify(mesh: SeamedMesh) -> AtlasVerdict:
+    """Certify a map as `atlas.certify` does, but also call a single island mirrored if all its triangles are negative.
+
+    In Blender the single island is often one of several, the chosen one.
+    """
+    upright = reflect_single(mesh)
+    verdict = atlas.certify(upright)
+    if upright is mesh:
+        return verdict
+    return replace(verdict, islands=tuple(replace(island, mirrored=True) for island in verdict.islands))
 
 
 def marked_edges(data: bpy.types.Mesh, mark: str) -> IntArray:

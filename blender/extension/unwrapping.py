@@ -72,19 +72,21 @@ def read_parts(objects: Sequence[bpy.types.Object], *, edited: bool) -> list[Par
     Raises
     ------
     Refused
-        If there are no such faces, or a mesh is linked from another file.
+        If there are no such faces, a mesh is linked from another file, or the scale of an object is not finite.
     """
     parts: list[Part] = []
     for thing in objects:
         data = thing.data
         if any(part.data == data for part in parts) or not len(data.polygons):
             continue
-        if data.library is not None:
-            raise Refused(f"{thing.name} is linked from another file, so its UVs cannot be changed")
+        surface.require_local(thing)
         if edited and numbers(data.polygons, "hide", 1, np.bool_).all():
             continue
         here = surface.read(data, edited=edited, chosen_only=False)
-        V = here.mesh.V @ _stretch_of(np.array(thing.matrix_world)[:3, :3])
+        matrix = np.array(thing.matrix_world)[:3, :3]
+        if not np.isfinite(matrix).all():
+            raise Refused(f"the scale or rotation of {thing.name} is not finite: clear it (Object > Clear)")
+        V = here.mesh.V @ _stretch_of(matrix)
         seams, sharp = (surface.marked_edges(data, name) for name in ("use_seam", "use_edge_sharp"))
         parts.append(Part(data, here, here.selected, V, seams, sharp, _pinned_islands(here)))
     if not parts:
@@ -226,8 +228,7 @@ def _seam_positions(part: Part) -> FloatArray:
     if len(seams):
         row = SeamedMesh(mesh.V, part.F).cut(seams).FT
         return np.stack([row, np.zeros_like(row)], axis=2).astype(np.float64)
-    if mesh.uv is None or len(part.surface.polygons) == len(mesh.islands) > 1:
-        # In a new UV layer of Blender, every face fills the square.
+    if mesh.uv is None or part.surface.blank:
         return np.zeros((len(part.F), 3, 2))
     return mesh.uv[mesh.FT[part.chosen]]
 

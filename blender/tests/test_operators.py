@@ -193,6 +193,30 @@ def test_repair_leaves_mirrored_islands_unless_asked():
     assert scenes.verdict(thing).injective
 
 
+@pytest.mark.parametrize("chosen", [False, True])
+def test_a_single_mirrored_island_is_called_mirrored(chosen, said):
+    V, flat, faces = scenes.quads(4)
+    thing = scenes.two_squares([1.5, 0], mirror=True) if chosen else scenes.add_mesh(V, faces, flat * [-1, 1])
+    thing.data.polygons.foreach_set("select", np.arange(len(thing.data.polygons)) >= len(thing.data.polygons) - 16)
+    before = scenes.places(thing)
+    if chosen:
+        bpy.context.tool_settings.mesh_select_mode = (False, False, True)
+        bpy.ops.object.mode_set(mode="EDIT")
+    assert bpy.ops.uv.qhm_repair() == {"FINISHED"}
+    assert bpy.ops.uv.qhm_reduce_stretch() == {"FINISHED"}
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert said().count("option Turn mirrored islands over") == 2
+    border = scenes.border(thing)
+    assert np.array_equal(scenes.places(thing)[border], before[border])
+    assert not np.array_equal(scenes.places(thing), before)
+    bpy.ops.uv.qhm_check()
+    assert scenes.selected(thing) == set()
+    assert "Info: Check UVs: 0 faces selected" in said()
+    bpy.ops.uv.qhm_repair(unmirror=True)
+    assert scenes.verdict(thing).injective
+    assert scenes.verdict(thing).mirrored.size == 0
+
+
 @pytest.mark.parametrize("energy", ["symmetric-dirichlet", "mips", "blend"])
 def test_reduce_stretch_keeps_borders(energy):
     thing = scenes.add_quads()
@@ -263,6 +287,29 @@ def test_fit(thing, fit):
         assert uv.min() >= 0
         assert uv.max() <= 1
         assert scenes.stretch(thing) > 4.5
+
+
+@pytest.mark.parametrize("letter", ["Q", "ß", "Ø"])
+def test_fit_to_letters_that_double_back_or_are_not_ascii(letter):
+    thing = scenes.add_quads(12)
+    assert bpy.ops.uv.qhm_fit(to="LETTER", letter=letter) == {"FINISHED"}
+    assert scenes.verdict(thing).bijective
+
+
+@pytest.mark.parametrize("edit", [False, True])
+def test_fit_treats_a_new_uv_layer_as_blank(edit):
+    thing = scenes.add_mesh(*scenes.quads(4)[::2])
+    thing.data.uv_layers.new()
+    if edit:
+        bpy.context.tool_settings.mesh_select_mode = (False, False, True)
+        thing.data.polygons.foreach_set("select", np.arange(16) < 3)
+        thing.data.polygons[15].hide = True
+        bpy.ops.object.mode_set(mode="EDIT")
+    assert bpy.ops.uv.qhm_fit(to="DISK") == {"FINISHED"}
+    bpy.ops.object.mode_set(mode="OBJECT")
+    found = scenes.verdict(thing)
+    assert [len(island.triangles) for island in found.islands] == ([30, 2] if edit else [32])
+    assert found.bijective
 
 
 def test_a_square_fitted_to_a_rectangle_has_its_corners_at_the_corners():

@@ -3,6 +3,7 @@
 import importlib
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -46,6 +47,50 @@ def test_without_a_mesh(act):
     assert not getattr(bpy.ops.uv, f"qhm_{act}").poll()
 
 
+@pytest.mark.parametrize("act", ALL)
+def test_linked_from_another_file(act, tmp_path):
+    thing = scenes.add_quads()
+    bpy.data.libraries.write(str(tmp_path / "other.blend"), {thing})
+    bpy.data.objects.remove(thing)
+    with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (there, here):
+        here.objects = there.objects
+    (thing,) = here.objects
+    bpy.context.collection.objects.link(thing)
+    thing.select_set(True)
+    bpy.context.view_layer.objects.active = thing
+    before = scenes.places(thing)
+    assert "linked from another file" in refused(act)
+    assert np.array_equal(scenes.places(thing), before)
+    bpy.data.libraries.remove(thing.data.library)
+
+
+@pytest.mark.parametrize("act", ["flatten", "reduce_stretch"])
+def test_advice_names_operators_of_blender(act):
+    V, flat, faces = scenes.quads(4)
+    narrow, turned = V.copy(), faces.copy()
+    narrow[7], turned[5] = V[6], faces[5, ::-1]
+    scenes.add_mesh(narrow, faces, flat)
+    assert "Degenerate Dissolve, or use Unwrap Model" in refused(act)
+    scenes.add_mesh(V, turned, flat)
+    assert "Recalculate Outside, or use Unwrap Model" in refused(act)
+
+
+def test_replaced_advice_is_that_of_the_package(extension):
+    import quasiharmonic
+    from quasiharmonic.results import Kind
+
+    advice = importlib.import_module(f"{extension}.advice").ADVICE
+    sources = [path.read_text(encoding="utf-8") for path in Path(quasiharmonic.__file__).parent.rglob("*.py")]
+    sources.append(Kind.REVERSED.value)
+    assert not [said for said in advice if not any(said in text for text in sources)]
+
+
+def test_unwrap_of_an_object_whose_scale_is_no_number():
+    scenes.add_quads().scale = (float("nan"), 1, 1)
+    bpy.context.view_layer.update()
+    assert "scale or rotation of thing is not finite" in refused("unwrap")
+
+
 @pytest.mark.parametrize("act", ["flatten", "fit"])
 def test_closed_without_seams(act):
     bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=2, calc_uvs=False)
@@ -87,6 +132,10 @@ def test_fit_to_what_is_no_outline():
     assert "no outline" in refused("fit", to="CURVE", curve=empty)
     assert "no closed outline" in refused("fit", to="CURVE", curve="line")
     assert "name a letter" in refused("fit", to="LETTER", letter=" ")
+    assert "only one" in refused("fit", to="LETTER", letter="éß")
+    for letter in ("k", "é"):
+        assert f"{letter!r} is in 2 separate pieces" in refused("fit", to="LETTER", letter=letter)
+    assert "choose another letter" in refused("fit", to="LETTER", letter="€")
     assert np.array_equal(scenes.places(thing), before)
     assert set(bpy.data.objects) == things
 
