@@ -299,3 +299,9 @@ def test_loops_that_begin_on_a_straight_side():
 @pytest.mark.slow
 def test_a_certificate_is_drawn():
     assert certify(SQUARE, CORNERS).plot().axes
+
+
+def test_large_integers_that_are_doubles_are_accepted():
+    assert certify([[0, 1, 2]], [[0, 0], [2**53, 0], [0, 2**54]]).bijective
+    with pytest.raises(ValueError, match="does not fit double precision"):
+        certify([[0, 1, 2]], [[0, 0], [2**53 + 1, 0], [0, 2**54]])

@@ -14,6 +14,7 @@ from quasiharmonic import (
     Problem,
     certify,
     distortion,
+    flatten,
     inverted_triangles,
     is_injective,
     polish,
@@ -223,3 +224,12 @@ def test_messages_state_the_numbering(options, said, counted, tmp_path, capsys):
 def test_an_energy_without_a_flattening(tmp_path, capsys):
     assert main(["batch", str(tmp_path), "-o", str(tmp_path / "out"), "--energy", "mips", "--polish", "mips"]) == 2
     assert "energy applies only to flatten" in capsys.readouterr().err
+
+
+def test_errors_of_arrays_of_other_libraries_are_reported():
+    class Broken:
+        def __array__(self, dtype=None, copy=None):
+            raise ValueError("the file is closed")
+
+    with pytest.raises(ValueError, match=r"V is a Broken .* the file is closed"):
+        flatten(Broken(), [[0, 1, 2]])

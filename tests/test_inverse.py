@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from fractions import Fraction
 
 import numpy as np
@@ -441,3 +442,22 @@ def test_the_inverse_of_an_unwrapped_model_with_defects(stack):
     assert np.allclose(np.einsum("kc,kcd->kd", outside.barycentric, beside), inverse.plane(outside))
     distance = np.linalg.norm(result.uvs[:, None] - [[-1.0, -1.0], [2.0, 0.5]], axis=2).min(axis=0)
     assert (np.linalg.norm(inverse.plane(outside) - [[-1.0, -1.0], [2.0, 0.5]], axis=1) <= distance + 1e-12).all()
+
+
+def test_the_inverse_of_an_unwrapped_model_owns_its_rows():
+    result = unwrap(*starfish(3, 4))
+    inverse = result.inverse()
+    at, before = inverse.vertices(), inverse.FT.copy()
+    places = inverse.plane(at)
+    result.indices[:] = 0
+    assert np.array_equal(inverse.FT, before)
+    np.testing.assert_array_equal(inverse.plane(at), places)
+    assert not pickle.loads(pickle.dumps(inverse)).FT.flags.writeable
+
+
+@pytest.mark.parametrize("scale", [1e-170, 1e170])
+def test_normals_of_extreme_surfaces(scale):
+    uv, F = grid(2, 2)
+    inverse = InverseMap(lift(uv) * scale, F, uv)
+    at = inverse.locate([[0.3, 0.4]])
+    np.testing.assert_allclose(inverse.normals(at), InverseMap(lift(uv), F, uv).normals(at))

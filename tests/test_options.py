@@ -7,7 +7,7 @@ import inspect
 import subprocess
 import sys
 from dataclasses import FrozenInstanceError, dataclass, fields
-from typing import TypedDict, Unpack
+from typing import ClassVar, TypedDict, Unpack
 
 import numpy as np
 import pytest
@@ -20,8 +20,9 @@ from quasiharmonic.linsolve import BACKENDS
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from quasiharmonic.solver.field.tensor import PARAMETERISATIONS
 from quasiharmonic.solver.search import harmonising, stages
-from quasiharmonic.ui.cli.arguments import add_options, declare_options
+from quasiharmonic.ui.cli.arguments import add_options, byte_count, declare_options
 from quasiharmonic.util import options
+from quasiharmonic.util.arrays import check_non_negative, check_weld
 from quasiharmonic.util.options import (
     AnimationOptions,
     DistanceOptions,
@@ -191,3 +192,25 @@ def test_numbers_of_the_command_line_have_the_type_of_their_field():
 def test_the_options_import_nothing_heavy():
     code = "import sys, quasiharmonic.util.options; print({'numpy', 'scipy'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "set()\n"
+
+
+def test_unsupported_types_have_no_option_on_the_command_line():
+    @dataclass(frozen=True)
+    class Named(Options):
+        shared: ClassVar[int] = 1
+        name: str = option("a", "a name")
+
+    with pytest.raises(TypeError, match="no option of type str: name"):
+        declare_options(Named)
+
+
+def test_sizes_beyond_the_range_of_floats_are_rejected():
+    with pytest.raises(argparse.ArgumentTypeError, match="not a size"):
+        byte_count("9" * 400)
+
+
+def test_numbers_beyond_the_range_of_floats_are_rejected():
+    with pytest.raises(ValueError, match="weld must be"):
+        check_weld(10**400)
+    with pytest.raises(ValueError, match="tol must be"):
+        check_non_negative("tol", 10**400)

@@ -212,6 +212,16 @@ def test_charts_are_packed_around_others():
         assert 256 * min(one.min() for one in packed.uv) >= 2
 
 
+def test_stacked_kept_charts_with_extremely_thin_triangles_are_bijective():
+    points, rows = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0.5, 0.5, 0]]), np.array([[0, 1, 3], [1, 2, 3]])
+    copies = np.concatenate([points, points + np.array([3, 0, 0]), points + np.array([6, 0, 0])])
+    thin = np.array([[0, 0], [0.25, 0], [0.25, 0.25], [0.125, 1e-18]])
+    triangles = np.concatenate([rows, rows + 4, rows + 8])
+    result = unwrap(copies, triangles, uv=np.tile(thin, (3, 1)), faces=[4, 5], stack=True, resolution=64)
+    assert result.certificate.bijective
+    assert result.status is UnwrapStatus.UNWRAPPED
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
 def test_faces_of_a_file(tmp_path, suffix):

@@ -36,6 +36,7 @@ from quasiharmonic.util.arrays import (
     index_array,
     list_others,
     real_array,
+    scale_to_unit,
     vertex_array,
 )
 
@@ -158,7 +159,7 @@ class InverseMap(ReadOnly):
         # The triangles of the locator, by rows of the map, and those of the surface: the same, except at seams.
         self._located, self._rows = self.F, self.F
 
-    def _read_only(self) -> tuple[FloatArray, IntArray, FloatArray]:
+    def _read_only(self) -> tuple[FloatArray | IntArray, ...]:
         return self.V, self.F, self.uv
 
     def locate(self, points: ArrayLike) -> SurfacePoints:
@@ -362,7 +363,7 @@ class InverseMap(ReadOnly):
         """Unit normal of every triangle; (f, 3)."""
         if self.V.shape[1] == 2:
             raise ValueError("a planar surface has no normals: V has shape (n, 2)")
-        a, b, c = self.V[self.F].swapaxes(0, 1)
+        a, b, c = scale_to_unit(self.V[self.F]).swapaxes(0, 1)
         normal = np.cross(b - a, c - a)
         with np.errstate(invalid="ignore"):
             return normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -423,13 +424,17 @@ class ChartInverse(InverseMap):
         rows = FT[self._triangles]
         self._turned = orientation(*uv[rows].swapaxes(0, 1)) < 0
         rows[self._turned] = rows[self._turned][:, (0, 2, 1)]
+        self.FT = FT.copy()
         # A position of the model for each row.
         vertex = np.zeros(len(uv), dtype=np.int64)
         vertex[FT] = F
         super().__init__(V[vertex], rows, uv, overlapping=True)
-        self.V, self.F, self.FT = V.copy(), F, FT
+        self.V, self.F = V.copy(), F
         self._seal()
-        self._located, self._rows = rows, FT
+        self._located, self._rows = rows, self.FT
+
+    def _read_only(self) -> tuple[FloatArray | IntArray, ...]:
+        return *super()._read_only(), self.FT
 
     def _number(self, triangle: IntArray, barycentric: FloatArray) -> tuple[IntArray, FloatArray]:
         turned = self._turned[triangle]

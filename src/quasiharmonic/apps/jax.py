@@ -129,7 +129,9 @@ def _compute(layer: Layer, names: tuple[str, ...], *arrays: Any) -> FloatArray:
     uv = exact.astype(_find_dtype("uv"))
     with _lock:
         for item, derivative in zip(np.ndindex(uv.shape[:-2]), derivatives, strict=True):
-            _recent[_key(layer, layer.item(given, item), uv[item].astype(np.float64))] = derivative
+            key = _key(layer, layer.item(given, item), uv[item].astype(np.float64))
+            _recent[key] = derivative
+            _recent.move_to_end(key)
         while len(_recent) > _MAX_RECENT:
             _recent.popitem(last=False)
     return uv

@@ -174,14 +174,13 @@ def _find_rounded(given: ArrayLike, positions: FloatArray) -> IntArray:
     if stored.dtype.kind == "f" and not isinstance(given, list | tuple):
         return np.empty(0, dtype=np.int64)
     large = np.argwhere(np.abs(positions) >= 2.0**53)
-    if stored.dtype.kind == "f":
-        # NumPy converts a list of integers and floats to doubles, which rounds large integers.
-        kept = [at for at in large.tolist() if _is_rounded(given, positions, *at)]
-        large = np.array(kept, dtype=np.int64).reshape(-1, 2)
-    return np.unique(large[:, 0])
+    # NumPy converts a list of integers and floats to doubles, which rounds large integers.
+    source = given if stored.dtype.kind == "f" else stored
+    rounded = [vertex for vertex, axis in large.tolist() if _is_rounded(source, positions, vertex, axis)]
+    return np.unique(np.array(rounded, dtype=np.int64))
 
 
 def _is_rounded(given: Any, positions: FloatArray, vertex: int, axis: int) -> bool:
-    """Return whether an integer in nested lists differs from the double that it was converted to."""
+    """Return whether an integer in an array or nested lists differs from the double that it was converted to."""
     number = given[vertex][axis]
     return not isinstance(number, float | np.floating) and int(number) != int(positions[vertex, axis])

@@ -395,9 +395,9 @@ def _array(name: str, values: ArrayLike) -> NDArray[Any]:
         if hasattr(values, "__dlpack__") and not hasattr(values, "__array__"):
             return np.from_dlpack(cast(Any, values))
         return np.asarray(values)
-    except ValueError as error:
-        raise ValueError(f"{name} is not an array: its rows differ in length") from error
-    except (TypeError, RuntimeError, BufferError) as error:
+    except (TypeError, ValueError, RuntimeError, BufferError) as error:
+        if isinstance(error, ValueError) and isinstance(values, list | tuple):
+            raise ValueError(f"{name} is not an array: its rows differ in length") from error
         raise ValueError(f"{name} is {describe(values)} {_explain_failure(name, values, error)}") from error
 
 
@@ -454,9 +454,14 @@ def check_bool(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be True or False, not {describe(value)}")
 
 
+def _is_non_negative(value: Any) -> bool:
+    """Return whether a number is finite and at least zero; integers beyond the range of floats count as infinite."""
+    return bool(0 <= value <= float(np.finfo(np.float64).max))
+
+
 def check_weld(value: Any) -> None:
     """Raise a ValueError unless the value is a boolean or a finite number of at least zero, a relative distance."""
-    if not isinstance(value, bool | np.bool_ | Real) or not 0 <= float(value) < np.inf:
+    if not isinstance(value, bool | np.bool_ | Real) or not _is_non_negative(value):
         raise ValueError(
             "weld must be True, False, or a distance relative to the diagonal of the bounding box, a finite number of "
             f"at least 0, not {describe(value)}"
@@ -465,7 +470,7 @@ def check_weld(value: Any) -> None:
 
 def check_non_negative(name: str, value: Any) -> None:
     """Raise a ValueError unless the value is a finite number of at least zero."""
-    if not isinstance(value, Real) or not 0 <= float(value) < np.inf:
+    if not isinstance(value, Real) or not _is_non_negative(value):
         raise ValueError(f"{name} must be a finite number of at least 0, not {describe(value)}")
 
 

@@ -287,6 +287,7 @@ def _to_comparable(value: Any) -> Hashable:
         return tuple(_to_comparable(one) for one in value)
     if isinstance(value, np.ndarray):
         return value.shape, value.tobytes()
+    # The identity stays unique, because the closures of each layer keep the object alive.
     return value if isinstance(value, str | bool | int | float | None) else id(value)
 
 

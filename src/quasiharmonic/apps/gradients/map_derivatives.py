@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypedDict, Unpack, get_args
+from typing import TypedDict, Unpack, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,6 +49,8 @@ from quasiharmonic.util.options import FlattenOptions, PolishOptions, takes
 
 # Error message for maps that are not injective.
 _NOT_FOUND = "no map was found, so there is no derivative"
+# A coefficient μ that `TANH.invert` changes by more was clipped; rounding changes it by about 1e-16.
+_CLIPPED = 1e-12
 
 
 def quasi_harmonic_derivative(
@@ -111,12 +113,14 @@ def quasi_harmonic_derivative(
     uv = problem.positions(iterate.w)
     dw = mesh.derivatives(to_complex(uv - problem.frame.centre))
     double = 2.0 / field.defect
-    c, twist = double - 1.0, double * field.mu
+    c, omega = double - 1.0, double * field.mu
     zero = np.zeros_like(field.mu)
-    form = QuadraticForm(pp=2 * c, qq=2 * c, p2=zero, q2=zero, pq=zero, pqc=-4 * twist)
+    # φ is quadratic in (p, q). So its second derivative along (dp, dq) is the constant form 2 φ(dp, dq), and its
+    # gradient is the matrix of this form times (p, q), which `apply` returns.
+    form = QuadraticForm(pp=2 * c, qq=2 * c, p2=zero, q2=zero, pq=zero, pqc=-4 * omega)
     by_p, by_q = form.apply(dw.p, dw.q)
     corners = np.ascontiguousarray(problem.F.T)
-    clipped = np.abs(field.mu - coefficients) > 1e-12
+    clipped = np.abs(field.mu - coefficients) > _CLIPPED
     equilibrium = Equilibrium(
         fixed=problem.fixed,
         forces=Forces(corners, problem.n, half, mesh.m, dw.p, dw.q, by_p, by_q, form),
@@ -215,13 +219,16 @@ def differentiate_polish(domain: Domain, uv: ArrayLike, options: PolishOptions) 
     measure, exponent = scale_energy(domain, start, chosen, counts)
     w = in_units(start, exponent)
     strain = _make_strain(domain)
-    by_rest = _differentiate_surface_size(strain)
+    # The energy measures the map times s = (size of the surface) / (size of the map), where a size is the root of an
+    # area. So log s falls with the logarithm of the map's size. If the boundary slides, its curves determine
+    # that size, and they count as constant.
+    by_places = np.zeros_like(w)
     if track is None:
         freedom = Freedom(measure, domain.n, domain.fixed, options.linear_solver)
-        scale = Scale(-differentiate_map_size(w, domain.loops), by_rest)
+        by_places = -differentiate_map_size(w, domain.loops)
     else:
         freedom = SlidingFreedom(measure, track, domain, exponent, options.linear_solver)
-        scale = Scale(np.zeros_like(w), by_rest)
+    scale = Scale(by_places, _differentiate_surface_size(strain))
     minimum = Minimum(measure, w, freedom)
     placed = _place_map(minimum.w, exponent, np.setdiff1d(domain.fixed, freedom.sliding), start)
     # Curves determine the positions of the vertices that slide, and of those at corners.
@@ -231,9 +238,16 @@ def differentiate_polish(domain: Domain, uv: ArrayLike, options: PolishOptions) 
 
 
 def _make_equilibrium(
-    domain: Domain, minimum: Minimum, strain: RestStrain, exponent: int, **further: Any
+    domain: Domain,
+    minimum: Minimum,
+    strain: RestStrain,
+    exponent: int,
+    *,
+    scale: Scale | None,
+    gauge: Gauge | None = None,
+    on_curves: IntArray | None = None,
 ) -> Equilibrium:
-    """Return the equilibrium at a minimum in units of ``2 ** exponent``; ``further`` are other attributes."""
+    """Return the equilibrium at a minimum in units of ``2 ** exponent``; the keywords are attributes of it."""
     return Equilibrium(
         fixed=domain.fixed,
         forces=minimum.forces,
@@ -241,7 +255,9 @@ def _make_equilibrium(
         make_strain=lambda: strain,
         rest_shape=domain.V.shape,
         unit=2.0**exponent,
-        **further,
+        scale=scale,
+        gauge=gauge,
+        on_curves=on_curves,
     )
 
 
@@ -327,7 +343,12 @@ def flatten_derivative(
 
 
 def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: FlattenOptions) -> Derivative:
-    """Converge a flattened map to rounding, and differentiate it; see `flatten_derivative`."""
+    """Converge a flattened map to rounding, and differentiate it; see `flatten_derivative`.
+
+    1. Find the transformations that do not change the energy. Constraints on one or two vertices exclude these.
+    2. If the scale is free, converge at any scale, and scale the map to the surface's area.
+    3. Converge to the minimum. If the map would then overlap itself, keep the map of step 2.
+    """
     domain = Domain(V, F, () if options.fixed is None else options.fixed)
     chosen = find_energy(options.energy)
     start = check_injective(domain, uv, _NOT_FOUND)
@@ -340,34 +361,54 @@ def differentiate_flattened(V: ArrayLike, F: ArrayLike, uv: ArrayLike, options: 
         chosen,
         weights=None if options.weights is None else positive_weights(options.weights, len(domain.F)),
     )
-    gauge = _gauge(measure, w, domain)
-
-    def find_minimum(w: ComplexArray, *, converge: bool = True) -> Minimum:
-        fixed, sliding, tangent = domain.fixed, None, None
-        if gauge is not None:
-            fixed, sliding, tangent = replace(gauge, w=w).constraints()
-        freedom = Freedom(measure, w.size, fixed, options.linear_solver, sliding, tangent)
-        return Minimum(measure, w, freedom, converge=converge)
-
+    gauge = _find_gauge(measure, w, domain)
+    find_minimum = partial(_find_minimum, domain, measure, gauge, options.linear_solver)
+    scale = None
     if gauge is not None and gauge.keeps_area:
-        # First converge at any scale, then scale to the surface's area.
         w = find_minimum(w).w
         size = float(np.ldexp(strain.m, -2 * exponent).sum())
         w = (w - w.mean()) * np.sqrt(size / signed_areas(domain.F, w).sum()) + w.mean()
-    minimum, doubts = find_minimum(w), []
-    if _overlaps(domain, minimum.w) and not _overlaps(domain, w):
-        minimum, doubts = find_minimum(w, converge=False), [Doubt.CONTACT]
-    scale = None
-    if gauge is not None and gauge.keeps_area:
+        # Here s is the size of the surface alone, because the map is scaled to this size.
         scale = Scale(np.zeros_like(w), _differentiate_surface_size(strain))
-    gauge = None if gauge is None else replace(gauge, w=minimum.w)
-    equilibrium = _make_equilibrium(domain, minimum, strain, exponent, scale=scale, gauge=gauge)
+    minimum, doubts = _converge_apart(domain, find_minimum, w)
+    final_gauge = None if gauge is None else replace(gauge, w=minimum.w)
+    equilibrium = _make_equilibrium(domain, minimum, strain, exponent, scale=scale, gauge=final_gauge)
     placed = _place_map(minimum.w, exponent, domain.fixed, start)
     return Derivative(placed, equilibrium, [*doubts, *minimum.doubts])
 
 
-def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge | None:
-    """The transformations that do not change the energy; None if there are at least two fixed vertices."""
+def _converge_apart(
+    domain: Domain, find_minimum: Callable[..., Minimum], w: ComplexArray
+) -> tuple[Minimum, list[Doubt]]:
+    """Return the minimum near a map ``w``, or ``w`` itself with a doubt if its boundary is in contact with itself.
+
+    A contact barrier of `flatten` keeps the boundary apart. The energy here lacks it, so Newton steps to its minimum
+    would make the map overlap itself. Such a map stays, and the remaining forces are those of the contact.
+    """
+    minimum = find_minimum(w)
+    if _overlaps(domain, minimum.w) and not _overlaps(domain, w):
+        return find_minimum(w, converge=False), [Doubt.CONTACT]
+    return minimum, []
+
+
+def _find_minimum(
+    domain: Domain,
+    measure: DeformationEnergy,
+    gauge: Gauge | None,
+    linear_solver: str,
+    w: ComplexArray,
+    *,
+    converge: bool = True,
+) -> Minimum:
+    """Return the minimum near a map ``w``, constrained by the gauge at this map; see `Minimum` for ``converge``."""
+    fixed, sliding, tangent = domain.fixed, None, None
+    if gauge is not None:
+        fixed, sliding, tangent = replace(gauge, w=w).constraints()
+    return Minimum(measure, w, Freedom(measure, w.size, fixed, linear_solver, sliding, tangent), converge=converge)
+
+
+def _find_gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge | None:
+    """Return the transformations that do not change the energy; None if there are at least two fixed vertices."""
     if domain.fixed.size > 1:
         return None
     # Energies beyond the range of doubles are reported where derivatives are taken.
@@ -378,4 +419,5 @@ def _gauge(measure: DeformationEnergy, w: ComplexArray, domain: Domain) -> Gauge
 
 
 def _overlaps(domain: Domain, w: ComplexArray) -> bool:
+    """Return whether the boundary of a map touches or crosses itself."""
     return bool(check_loops(domain.loops, to_points(w))[1])

@@ -126,28 +126,34 @@ def certify_charts(
     padding : float
         Required distance between charts in texels.
     stacked : bool
-        Whether charts at the same place are intended. They are certified side by side.
+        Whether charts at the same place are intended. They are certified in layers, with one chart of each place, and
+        stay where they are: a shift could round kept coordinates.
     """
-    F, chart = layout.F, layout.chart
-    chart_of_vertex = np.zeros(len(layout.uv), dtype=np.int64)
-    chart_of_vertex[F] = chart[:, None]
-    uv = layout.uv
+    chart, chart_of_vertex = layout.chart, np.zeros(len(layout.uv), dtype=np.int64)
+    chart_of_vertex[layout.F] = chart[:, None]
+    layers = [np.arange(len(chart))]
     if stacked:
-        # A shift by a whole number is exact.
-        shift = np.ceil(np.abs(uv).max()) + 1
-        uv = uv + shift * _rank_in_stack(uv, chart_of_vertex)[chart_of_vertex, None]
-    whole = certificate.certify(F, uv)
-    wrong = np.concatenate([whole.inverted, whole.degenerate, whole.nonfinite])
-    good = ~mark(int(chart.max(initial=-1)) + 1, chart[wrong])
-    overlapping = np.empty((0, 2), dtype=np.int64)
-    if any(reason.kind is not Obstacle.NOT_INJECTIVE for reason in whole.reasons):
-        good, overlapping = _find_faults(F, uv, chart, chart_of_vertex, whole)
+        layers = group_by_label(_rank_in_stack(layout.uv, chart_of_vertex)[chart])
+    inverted, degenerate, faulty, overlapping = list[int](), list[int](), set[int](), list[tuple[int, int]]()
+    clearance = np.inf
+    for rows in layers:
+        used, vertex = np.unique(layout.F[rows], return_inverse=True)
+        F, uv, charts = vertex.reshape(-1, 3), layout.uv[used], chart_of_vertex[used]
+        whole = certificate.certify(F, uv)
+        inverted += triangles[rows[whole.inverted]].tolist()
+        degenerate += triangles[rows[np.concatenate([whole.degenerate, whole.nonfinite])]].tolist()
+        faulty.update(chart[rows[np.concatenate([whole.inverted, whole.degenerate, whole.nonfinite])]].tolist())
+        if any(reason.kind is not Obstacle.NOT_INJECTIVE for reason in whole.reasons):
+            wrong, pairs = _find_faults(F, uv, charts, whole)
+            faulty |= wrong
+            overlapping += pairs
+        clearance = min(clearance, measure_clearance(whole.loops, uv * size, charts, 1.5 * padding))
     return UnwrapCertificate(
-        bijective_charts=good,
-        inverted=np.sort(triangles[whole.inverted]),
-        degenerate=np.sort(triangles[np.concatenate([whole.degenerate, whole.nonfinite])]),
-        overlapping=overlapping,
-        clearance=measure_clearance(whole.loops, uv * size, chart_of_vertex, 1.5 * padding),
+        bijective_charts=~mark(int(chart.max(initial=-1)) + 1, np.array(sorted(faulty), dtype=np.int64)),
+        inverted=np.array(sorted(inverted), dtype=np.int64),
+        degenerate=np.array(sorted(degenerate), dtype=np.int64),
+        overlapping=np.array(sorted(overlapping), dtype=np.int64).reshape(-1, 2),
+        clearance=clearance,
     )
 
 
@@ -167,23 +173,22 @@ def _rank_in_stack(uv: FloatArray, chart: IntArray) -> IntArray:
 
 
 def _find_faults(
-    F: IntArray, uv: FloatArray, chart: IntArray, chart_of_vertex: IntArray, whole: Certificate
-) -> tuple[BoolArray, IntArray]:
-    """Return which charts are bijective, and which pairs overlap, of charts that are not all bijective together."""
-    parts = [F[rows] for rows in group_by_label(chart)]
+    F: IntArray, uv: FloatArray, chart_of_vertex: IntArray, whole: Certificate
+) -> tuple[set[int], list[tuple[int, int]]]:
+    """Return the charts that are not bijective, and the pairs of others that overlap, given the verdict on all."""
+    label = chart_of_vertex[F[:, 0]]
+    parts = {int(label[rows[0]]): F[rows] for rows in group_by_label(label)}
 
-    def is_bijective(*rows: IntArray) -> bool:
-        used, own = np.unique(np.concatenate(rows), return_inverse=True)
-        return bool(certificate.certify(own.reshape(-1, 3), uv[used]).bijective)
+    def is_bijective(*charts: int) -> bool:
+        used, vertex = np.unique(np.concatenate([parts[chart] for chart in charts]), return_inverse=True)
+        return bool(certificate.certify(vertex.reshape(-1, 3), uv[used]).bijective)
 
-    good = np.array([is_bijective(rows) for rows in parts])
+    faulty = {chart for chart in parts if not is_bijective(chart)}
     candidates: set[tuple[int, int]] = set()
     for reason in whole.reasons:
-        around = sorted({int(chart_of_vertex[whole.loops[loop][0]]) for loop in reason.loops})
+        around = sorted({int(chart_of_vertex[whole.loops[loop][0]]) for loop in reason.loops} - faulty)
         candidates.update((one, other) for k, one in enumerate(around) for other in around[k + 1 :])
-    pairs = [pair for pair in sorted(candidates) if not is_bijective(*(parts[k] for k in pair))]
-    sound = [pair for pair in pairs if good[list(pair)].all()]
-    return good, np.array(sound, dtype=np.int64).reshape(-1, 2)
+    return faulty, [pair for pair in sorted(candidates) if not is_bijective(*pair)]
 
 
 def measure_clearance(loops: tuple[IntArray, ...], uv: FloatArray, chart_of_vertex: IntArray, reach: float) -> float:
@@ -254,64 +259,80 @@ def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tupl
         cleaned = clean(V, F)
     except ValueError:
         return None
-    spots = np.unique(V + 0.0, axis=0, return_inverse=True)[1].reshape(-1)[F]
-    places, inverse = np.unique(corner_uv.reshape(-1, 2) + 0.0, axis=0, return_inverse=True)
-    place = inverse.reshape(F.shape)
-    pairs, inverse = np.unique(spots * len(places) + place, return_inverse=True)
-    both = inverse.reshape(F.shape)
-    left = _find_copies(cleaned, both, place, len(places))
-    rows = np.flatnonzero(~left)
-    keys, first, corners = np.unique(both[rows], return_index=True, return_inverse=True)
-    G = corners.reshape(-1, 3)
+    texture_key = _number_rows(corner_uv.reshape(-1, 2)).reshape(F.shape)
+    pairs = _number_rows(V)[F] * (int(texture_key.max()) + 1) + texture_key
+    corner_key = np.unique(pairs, return_inverse=True)[1].reshape(F.shape)
+    excluded_copies = _find_copies(cleaned, corner_key, texture_key)
+    rows = np.flatnonzero(~excluded_copies)
     preferred = np.zeros(len(F), dtype=np.int64)
     preferred[cleaned.triangles] = np.where(cleaned.flipped, -1, 1)
-    turned = _orient(G, len(keys), preferred[rows])
-    G = turn_corners(G, turned)
-    points, uv = V[F[rows].ravel()[first]], places[pairs[keys] % len(places)]
-    verdict = certify(SeamedMesh(points, G, G, uv))
+    mesh, turned = _orient_mesh(V[F[rows]], corner_uv[rows], corner_key[rows], preferred[rows])
+    verdict = certify(mesh)
     # A texture is mirrored if `unwrap` treated an inside-out model as turned outward.
     inward = len(verdict.islands) == 1 and not verdict.injective and bool((cleaned.facing < 0).all())
     if inward:
-        verdict = certify(SeamedMesh(points, G[:, ::-1], G[:, ::-1], uv))
-    elif not (left.any() or turned.any()):
+        verdict = certify(SeamedMesh(mesh.V, mesh.F[:, ::-1], mesh.F[:, ::-1], mesh.uv))
+    elif not (excluded_copies.any() or turned.any()):
         return None
-    own = cleaned.excluded[~left[cleaned.excluded]]
     islands = tuple(
         replace(one, triangles=rows[one.triangles], inverted=rows[one.inverted], mirrored=one.mirrored or inward)
         for one in verdict.islands
     )
-    unsure = [k for k, one in enumerate(islands) if np.isin(one.triangles, own).all()] if own.size else []
+    excluded = mark(len(F), cleaned.excluded)
+    unsure = [k for k, one in enumerate(islands) if excluded[one.triangles].all()]
     if np.isin(verdict.overlapping, unsure).any():
         return None
-    repeated = cleaned.excluded[cleaned.repeated & left[cleaned.excluded]]
-    apart = SetApart(rows[turned], repeated, np.setdiff1d(np.flatnonzero(left), repeated))
+    repeated = cleaned.excluded[cleaned.repeated & excluded_copies[cleaned.excluded]]
+    apart = SetApart(rows[turned], repeated, np.setdiff1d(np.flatnonzero(excluded_copies), repeated))
     return replace(verdict, islands=islands), apart
 
 
-def _find_copies(cleaned: CleanedMesh, keys: IntArray, place: IntArray, count: int) -> BoolArray:
+def _number_rows(rows: FloatArray) -> IntArray:
+    """Return a number (n,) for each row, the same for equal rows; −0 equals 0."""
+    return np.unique(rows + 0.0, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _orient_mesh(
+    points: FloatArray, corner_uv: FloatArray, corner_key: IntArray, preferred: IntArray
+) -> tuple[SeamedMesh, BoolArray]:
+    """Return triangles as a mesh with consistently oriented charts, and which of them are reversed; see `_orient`.
+
+    Corners, with positions (k, 3, 3) and texture coordinates (k, 3, 2), become one vertex if their keys (k, 3) agree.
+    """
+    _, first, inverse = np.unique(corner_key, return_index=True, return_inverse=True)
+    vertex = inverse.reshape(-1, 3)
+    turned = _orient(vertex, first.size, preferred)
+    vertex = turn_corners(vertex, turned)
+    return SeamedMesh(points.reshape(-1, 3)[first], vertex, vertex, corner_uv.reshape(-1, 2)[first]), turned
+
+
+def _find_copies(cleaned: CleanedMesh, corner_key: IntArray, texture_key: IntArray) -> BoolArray:
     """Return which triangles are excluded by `clean`, or thin, and have the texture coordinates of another triangle.
 
     Parameters
     ----------
     cleaned : CleanedMesh
-    keys : (f, 3) int64
-        Number of the position and the coordinates at each corner. A repeated triangle must agree in both.
-    place : (f, 3) int64
-        Number of the coordinates, below ``count``. A triangle without area takes those of another triangle. Its
-        corners may also lie at an edge or a corner of others.
+    corner_key, texture_key : (f, 3) int64
+        Number of the position and the texture coordinates at each corner, and of the latter alone.
     """
-    copies = np.zeros(len(place), dtype=np.bool_)
     order = np.concatenate([cleaned.triangles, cleaned.excluded])
     of_excluded = slice(len(cleaned.triangles), None)
-    same, near = ((find_twins(table[order]) != np.arange(len(order)))[of_excluded] for table in (keys, place))
-    copies[cleaned.excluded] = np.where(cleaned.repeated, same, near)
-    ahead = place[:, (1, 2, 0)]
-    collapsed = (place == ahead).any(axis=1)
-    others = ~collapsed & ~copies
-    known = np.union1d(edge_keys(place[others], ahead[others], count), edge_keys(place[others], place[others], count))
+    agrees, covers = (
+        (find_twins(keys[order]) != np.arange(len(order)))[of_excluded] for keys in (corner_key, texture_key)
+    )
+    # A repeated triangle is a copy if an earlier one has the same positions and coordinates at its corners. A triangle
+    # without area is one if an earlier one has these coordinates, because its own corners may be anywhere.
+    copies = np.zeros(len(texture_key), dtype=np.bool_)
+    copies[cleaned.excluded] = np.where(cleaned.repeated, agrees, covers)
+    # A triangle without height whose image is a segment or a point is one if each of its sides lies on an edge or at a
+    # corner of triangles with an area in the texture. A corner counts as an edge from itself to itself.
+    n, ahead = int(texture_key.max()) + 1, texture_key[:, (1, 2, 0)]
+    sides, collapsed = edge_keys(texture_key, ahead, n), (texture_key == ahead).any(axis=1)
+    proper = ~collapsed & ~copies
+    edges_and_corners = np.union1d(sides[proper], edge_keys(texture_key[proper], texture_key[proper], n))
     flat = np.concatenate([cleaned.excluded[~cleaned.repeated], cleaned.triangles[cleaned.widened]])
     flat = flat[collapsed[flat]]
-    copies[flat] |= np.isin(edge_keys(place[flat], ahead[flat], count), known).all(axis=1)
+    copies[flat] |= np.isin(sides[flat], edges_and_corners).all(axis=1)
     return copies
 
 

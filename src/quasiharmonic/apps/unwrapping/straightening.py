@@ -125,6 +125,7 @@ def straighten_strips(
             worst, first = float(chart.stretch.max()), int(rows[0])
             if worst <= _STRAIGHT:
                 continue
+            # A part that a smaller angle leaves with the same first triangle replaces the larger part.
             strips[first] = Strip(first, int(grid.column.max()), int(grid.row.max()), worst, worst <= bound)
             if worst <= bound:
                 charts.append(chart)
@@ -173,10 +174,11 @@ def _lay_squares(F: IntArray, hinges: Hinges, joined: BoolArray, diagonal: BoolA
     side = np.zeros(len(F), dtype=np.int64)
     side[hinges.first[diagonal]], side[hinges.second[diagonal]] = hinges.one[diagonal] % 3, hinges.other[diagonal] % 3
     linked, _, component = find_forest(F, hinges, np.flatnonzero(joined))
-    # Half a square in each triangle, with its diagonal at this side.
+    # Half a unit square in each triangle: its diagonal is this side, from (0, 0) to (1, 1), and its apex is (0, 1).
+    # Rows of the table are the start of the diagonal, its end, and the apex; the third coordinate is zero.
     half = np.array([[0.0, 0.0, 0.0], [1, 1, 0], [0, 1, 0]])[(np.arange(3) - side[:, None]) % 3].reshape(-1, 3)
     place = lay_along(half, np.arange(F.size).reshape(-1, 3), hinges.one[linked], hinges.other[linked], component)
-    # The sides of the first square lie along the axes.
+    # Rotate each component so that its first triangle's leg from the diagonal's end to the apex is along x.
     first = np.unique(component, return_index=True)[1]
     leg = place[first, (side[first] + 2) % 3] - place[first, (side[first] + 1) % 3]
     return (place - place[first, side[first]][component][:, None]) / (leg / np.abs(leg))[component][:, None]
@@ -199,6 +201,8 @@ def _find_grid(
         What it costs to cut a tube at each hinge.
     """
     inner = here[~diagonal[here]]
+    # The translation of the layout across each edge between squares: zero in a grid, a multiple of the period in a tube
+    # along the edge where it is cut open. If the ends of an edge differ by two translations, one side is rotated.
     z, ahead = place.ravel(), np.roll(place, -1, axis=1).ravel()
     step = np.rint(z[hinges.one[inner]] - ahead[hinges.other[inner]])
     turned = np.abs(step - ahead[hinges.one[inner]] + z[hinges.other[inner]]) > 0.5
@@ -208,23 +212,38 @@ def _find_grid(
     # A tube goes around along its columns.
     period, turn = max(across, along), -1j if along else 1
     corners = np.rint(place[rows] * turn)
+    # The square of each triangle, by its lower left corner, and the corners of the triangle relative to this corner.
     cell = np.floor((place[rows] * turn).mean(axis=1).view(np.float64).reshape(-1, 2)).astype(np.int64)
     offset = np.stack([corners.real, corners.imag], axis=-1).astype(np.int64) - cell[:, None]
     cell[:, 1] -= cell[:, 1].min()
     if period:
-        line = np.rint((z[hinges.one[inner]] * turn).real).astype(np.int64)
-        end = np.rint((ahead[hinges.one[inner]] * turn).real).astype(np.int64)
-        upright = line == end
-        cell[:, 0] -= np.argmin(np.bincount(line[upright] % period, weight[inner[upright]], period))
+        side = hinges.one[inner]
+        cell[:, 0] -= _choose_cut(z[side] * turn, ahead[side] * turn, weight[inner], period)
         cell[:, 0] %= period
     else:
         cell[:, 0] -= cell[:, 0].min()
-    m, n = (cell.max(axis=0) + 1).tolist()
-    links = (m if period else m - 1) * n + m * (n - 1)
-    if inner.size != links or (np.bincount(cell[:, 0] * n + cell[:, 1], minlength=m * n) != 2).any():
+    if not _is_full_grid(cell, inner.size, tube=period > 0):
         return None
     corner = cell[:, None] + offset
     return _GridPlaces(corner[..., 0], corner[..., 1])
+
+
+def _choose_cut(start: ComplexArray, end: ComplexArray, weight: FloatArray, period: int) -> int:
+    """Return the column before which it costs least to cut a tube, given its edges' ends (k,) and weights (k,)."""
+    column, other = (np.rint(z.real).astype(np.int64) for z in (start, end))
+    upright = column == other
+    return int(np.argmin(np.bincount(column[upright] % period, weight[upright], period)))
+
+
+def _is_full_grid(cell: IntArray, links: int, *, tube: bool) -> bool:
+    """Return whether triangles in cells (k, 2), with a number of links between squares, are a grid without gaps.
+
+    Two triangles, one square, must be in each cell of the bounding rectangle. An edge links only squares in adjacent
+    cells, and each pair of these at most once. So if there are as many links as adjacent pairs, all of them are linked.
+    """
+    m, n = (cell.max(axis=0) + 1).tolist()
+    pairs = (m if tube else m - 1) * n + m * (n - 1)
+    return links == pairs and bool((np.bincount(cell[:, 0] * n + cell[:, 1], minlength=m * n) == 2).all())
 
 
 def _make_rectangle(V: FloatArray, F: IntArray, cost: FloatArray, rows: IntArray, grid: _GridPlaces) -> Chart:

@@ -52,8 +52,8 @@ def declare_options(operation: type[Options]) -> dict[str, Option]:
 
     Options of base classes are shared, and commands list these last.
     """
-    known = {one.name: one for one in fields(operation)}
-    return {name: _declare(known[name]) for name in operation.__annotations__ if known[name].metadata["help"]}
+    own = operation.__annotations__
+    return {one.name: _declare(one) for one in fields(operation) if one.name in own and one.metadata["help"]}
 
 
 def _declare(one: Field[Any]) -> Option:
@@ -65,6 +65,8 @@ def _declare(one: Field[Any]) -> Option:
     integer = {options.positive: count, options.positive_or_none: count, options.count: steps}.get(check, int)
     if one.type in ("int", "int | None"):
         return number(integer, words, default=one.default)
+    if one.type not in ("float", "float | None"):
+        raise TypeError(f"the command line has no option of type {one.type}: {one.name}")
     return number(float, words, metavar="SECONDS" if check is options.seconds else "X", default=one.default)
 
 
@@ -136,7 +138,7 @@ def byte_count(text: str) -> int:
     """Convert a size such as 800M or 4G to bytes; for argparse."""
     found = re.fullmatch(r"([0-9]+\.?[0-9]*|\.[0-9]+)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
     value = 0.0 if found is None else float(found[1]) * 1024 ** " KMGT".index(found[2].upper() or " ")
-    if value < 1:
+    if not 1 <= value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a size such as 800M or 4G")
     return int(value)
 

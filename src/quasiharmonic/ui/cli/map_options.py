@@ -262,10 +262,10 @@ def _check_room(problem: Problem, to: str) -> None:
 
 def read_corners(text: str) -> CornerSpec:
     """Read the value of ``--corners``, or the file that it names; ValueError if it is malformed."""
-    from quasiharmonic.targets.boundary import corner_pins as asked_corners
+    from quasiharmonic.targets.boundary import corner_pins
 
     try:
-        return asked_corners.read_corners(text)
+        return corner_pins.read_corners(text)
     except ValueError as error:
         raise ValueError(f"--corners {text}: {error}") from None
 

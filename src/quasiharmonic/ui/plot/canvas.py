@@ -147,9 +147,9 @@ def _frame(area: FloatArray, total: float) -> FloatArray:
 def shade(hue: FloatArray, light: FloatArray) -> FloatArray:
     """Darken colours (k, 3) turned away from the light and whiten those that face it; ``light`` (k,) is −1 to 1."""
     strength = ((1 + light) / 2)[:, None]  # never black, because a map also shows unlit triangles
-    shade = 0.15 + 0.95 * np.minimum(strength / 0.8, 1)
+    brightness = 0.15 + 0.95 * np.minimum(strength / 0.8, 1)
     gleam = 0.42 * np.maximum(strength - 0.8, 0) / 0.2
-    shaded = hue * shade
+    shaded = hue * brightness
     return np.asarray(np.clip(shaded + (1 - shaded) * gleam, 0, 1))
 
 
