@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.util.arrays import FloatArray, as_offsets
 
-IntArray = NDArray[np.integer]
+Indices = NDArray[np.integer]
 Codes = NDArray[np.int32]
 
 
@@ -51,7 +51,7 @@ _TUNING = DissectionTuning()
 BITS = 4
 
 
-def nested_dissection(points: FloatArray, tail: IntArray, head: IntArray) -> NDArray[np.int64] | None:
+def nested_dissection(points: FloatArray, tail: Indices, head: Indices) -> NDArray[np.int64] | None:
     """Order the vertices of a mesh for elimination, (n,) int64; ``tail`` and ``head`` (e,) are the ends of its edges.
 
     The result is None if planes make poor cuts, because the surface is folded or the points coincide.
@@ -63,9 +63,7 @@ def nested_dissection(points: FloatArray, tail: IntArray, head: IntArray) -> NDA
     rank = separators(code, levels, tail, head)
     if _factor_work(code, rank) > _TUNING.max_work * n**1.5:
         return None
-    # A part of rank k is a range of 2^k codes. Its separator follows the last code and the separators of its own parts.
-    end = ((code >> rank) + 1) << rank
-    return np.argsort(end.astype(np.int64) << 5 | rank, kind="stable")
+    return np.argsort(_number_separators(code, rank), kind="stable")
 
 
 def _bisect(points: FloatArray, levels: int) -> Codes:
@@ -112,7 +110,7 @@ def _grid_cells(points: FloatArray, part: Codes, parts: int) -> Codes:
 _SPREAD = np.array([sum((k >> b & 1) << 2 * b for b in range(BITS)) for k in range(2**BITS)], dtype=np.int32)
 
 
-def separators(code: Codes, levels: int, tail: IntArray, head: IntArray) -> NDArray[np.uint8]:
+def separators(code: Codes, levels: int, tail: Indices, head: Indices) -> NDArray[np.uint8]:
     """Rank of the largest part whose halves each vertex separates; 0 if the vertex separates nothing.
 
     A part of rank k consists of all vertices whose codes differ only in the last k bits.
@@ -136,7 +134,7 @@ def separators(code: Codes, levels: int, tail: IntArray, head: IntArray) -> NDAr
     return rank
 
 
-def _smaller_sides(u: IntArray, v: IntArray, part: Codes) -> tuple[IntArray, IntArray]:
+def _smaller_sides(u: Indices, v: Indices, part: Codes) -> tuple[Indices, Indices]:
     """Separators from the edges u-v that cross cuts: for each part, the ends on the side with fewer of them."""
     marked = np.zeros(part.size, dtype=bool)
     sides = []
@@ -149,7 +147,7 @@ def _smaller_sides(u: IntArray, v: IntArray, part: Codes) -> tuple[IntArray, Int
     return sides[0][fewer[part[sides[0]]]], sides[1][~fewer[part[sides[1]]]]
 
 
-def smallest_cover(u: IntArray, v: IntArray) -> tuple[IntArray, IntArray]:
+def smallest_cover(u: Indices, v: Indices) -> tuple[Indices, Indices]:
     """Minimum vertex cover of the edges u-v; about a tenth smaller than the vertices of either side.
 
     By Kőnig's theorem it has as many vertices as a maximum matching has edges. Start at the unmatched u and alternate
@@ -179,6 +177,15 @@ def smallest_cover(u: IntArray, v: IntArray) -> tuple[IntArray, IntArray]:
 
 def _factor_work(code: Codes, rank: NDArray[np.uint8]) -> float:
     """Sum of the cubes of the sizes of the separators and of the remaining parts."""
-    end = ((code >> rank) + 1) << rank
-    _, size = np.unique(end.astype(np.int64) << 5 | rank, return_counts=True)
+    _, size = np.unique(_number_separators(code, rank), return_counts=True)
     return float(np.sum(size.astype(np.float64) ** 3))
+
+
+def _number_separators(code: Codes, rank: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Number (n,) of each vertex's separator, in the order of elimination.
+
+    A part of rank k, below 32, is a range of 2^k codes. Its separator follows the last code and the separators of its
+    own parts.
+    """
+    end = ((code >> rank) + 1) << rank
+    return end.astype(np.int64) << 5 | rank

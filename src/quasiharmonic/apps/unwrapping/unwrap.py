@@ -53,6 +53,8 @@ class UnwrapKeywords(TypedDict, total=False):
     jobs: int | None
 
 
+# From the inside: options are checked, progress is shown for one model, meshes become arrays, the file of a mesh is
+# asked for hard edges while it is one, and scenes are calls for their meshes together.
 @accepts_scene
 @reads_hard_edges
 @accepts_mesh

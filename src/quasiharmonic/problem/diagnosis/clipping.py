@@ -203,6 +203,7 @@ class Walls:
         Return the visible parts, the most promising last, and the walls that may still hide some of these parts. The
         parts are None if no wall hides any of the area.
         """
+        # About 100 µs for the calls of NumPy, and 1 µs for twenty pairs of a wall and a corner.
         self._effort.spend(100 + len(walls) * len(approximate) // 20)
         here = self._lattice.approximate[eye]
         p, q = self._lattice.approximate[walls.T]

@@ -126,7 +126,7 @@ class SearchRecord:
         self.work.stages.append(Stage(name, n_iterations, seconds, inverted, energy, kept))
 
     def replace_best(self, w: ComplexArray, inverted: int) -> None:
-        """Replace the best map by ``w`` with its own tensors."""
+        """Replace the best map by ``w`` with its own tensors, at which V₃ vanishes if the map is injective."""
         mesh = self.problem.domain.mesh("equilateral")
         dw = mesh.derivatives(w)
         field = TANH.field(TANH.invert(own_tensor(dw.p, dw.q)))

@@ -59,8 +59,8 @@ def surface(
     """Return the surface of a file with the seams that the options request.
 
     If the mesh is welded, ``joint`` (n,) has the representative of each vertex, which the list of edges may name.
-    ValueError or OSError as `find_cuts`. Also if only some faces have texture coordinates although there are seams, or
-    a line of the list of edges is wrong.
+    ValueError if cuts or demanded edges are impossible (`find_cuts`), only some faces have texture coordinates although
+    there are seams, or a line of the list of edges is wrong; OSError if that list cannot be read.
     """
     from quasiharmonic import io
     from quasiharmonic.io.seamed_mesh import SeamedMesh

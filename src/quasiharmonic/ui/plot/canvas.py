@@ -123,6 +123,9 @@ def _frame(area: FloatArray, total: float) -> FloatArray:
 
     The vector area of an open surface points to where most of the surface is visible. The vector area of an almost
     closed surface points away from its hole, and such models usually stand on the hole.
+
+    ``openness`` is 1 for flat surfaces, which are shown from the front, and 0 for closed ones. Where the hole says
+    nothing, because it is tiny or faces no axis, the y-axis is up.
     """
     openness = np.linalg.norm(area) / total if total > 0 else 0.0
     if openness > 0.999:
