@@ -184,6 +184,15 @@ def test_coincident_vertices_are_merged_unless_told_otherwise():
     assert check(*soup(V, F), weld=False).facing.size == len(F)
 
 
+def test_isolated_degenerate_triangles_take_the_coordinates_of_the_nearest_vertex():
+    V = np.array(
+        [[0, 0, 0], [6, 0, 0], [0, 1, 0], [5, 3, 0], [6, 3, 0], [5, 4, 0], [6.1, 0, 0], [6.2, 0, 0], [9, 0, 0]]
+    )
+    cleaned = clean(V, np.arange(9).reshape(3, 3)[[1, 0, 2]])
+    assert cleaned.excluded.tolist() == [2]
+    assert cleaned.substitutes.tolist() == [1]
+
+
 def test_degenerate_triangles_take_the_coordinates_of_a_neighbour():
     V, F = disk(3)
     n = len(V)

@@ -43,15 +43,15 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 class FitTuning(NamedTuple):
     """Numbers that tune the fits of maps to rotated triangles, and their repair."""
 
-    # Number of first fits, to rotated triangles. Later fits permit some stretch.
+    # Number of further fits to rotated triangles, after the first one. Later fits permit some stretch.
     rotated_fits: int = 4
-    # Least number of all fits, after which the search stops when the bound is kept.
+    # Least number of further fits, after which they stop when the aim is reached.
     least_fits: int = 6
-    # The bound counts as kept if at most this part of the free share exceeds it: repairs may stretch a little more.
+    # The aim counts as reached if at most this part of the free share exceeds it: repairs may stretch a little more.
     enough: float = 0.5
-    # Largest number of all fits.
+    # Largest number of further fits.
     most_fits: int = 16
-    # A later fit permits this share of the stretch that the bound permits.
+    # A later fit permits this share of the stretch that the aim permits.
     permitted: float = 0.5
     # A triangle whose singular values have a smaller ratio gets a new rotation.
     least_ratio: float = 0.15
@@ -69,16 +69,23 @@ _TUNING = FitTuning()
 
 
 class CoarseSearch:
-    """A search for charts on the coarse mesh of a surface with vertices ``V`` (n, 3)."""
+    """A search for charts on the coarse mesh of a surface with vertices ``V`` (n, 3).
+
+    `find_cuts_by` calls it for the coarse mesh of each large part of the surface, for the seams there. When it has
+    carried the seams to the surface, `start` gives the charts between them the maps of the coarse charts.
+    """
 
     def __init__(self, bound: float, min_gain: float, workers: Workers, V: FloatArray) -> None:
         self._bound, self._min_gain, self._workers, self._V = bound, min_gain, workers, V
+        # The coarse chart of each vertex, -1 where it is unknown, as on seams, and the vertex's position there.
         self._chart, self._place = np.full(len(V), -1), np.zeros(len(V), dtype=np.complex128)
+        # Number of coarse charts of all calls.
         self._count = 0
 
     def __call__(self, graph: EdgeGraph, vertices: IntArray, rounds: list[list[Removal]]) -> BoolArray:
         """Return the seams (e,) of the charts of a coarse mesh."""
         F = graph.F
+        # The factors on the costs of the sides: the costs, over what they would be without factors.
         cost = (graph.cost / edge_graph(graph.V, F).cost)[graph.side].T
         coarser = None
         if graph.n <= _TUNING.largest_share * len(self._V):
@@ -123,17 +130,18 @@ class CoarseSearch:
 
     def _start(self, chart: WorkingChart) -> None:
         of = self._chart[chart.vertices]
+        # At copies of a vertex, the chart meets itself, and each copy would need another position.
         _, copy, times = np.unique(chart.vertices, return_inverse=True, return_counts=True)
         of[times[copy] > 1] = -1
+        # Seams have moved since, so that the chart may have parts of other coarse charts, which have other frames.
         count = np.bincount(of[of >= 0], minlength=1)
         known = of == int(np.argmax(count))
         if not known.any():
             return
         g = chart.piece.energy(SymmetricDirichlet(), None).g
+        aim = 1 + AIM_OF_CARRIED * (self._bound - 1)
         try:
-            chart.start = _fit(
-                chart, g, self._place[chart.vertices], known, 1 + AIM_OF_CARRIED * (self._bound - 1), self._workers
-            )
+            chart.start = _fit(chart, g, self._place[chart.vertices], known, aim, self._workers)
         except NotPositiveDefinite:
             return
 
@@ -154,11 +162,13 @@ def cut_into_charts(
 
 
 def _fit(
-    chart: WorkingChart, g: ComplexArray, w: ComplexArray, known: BoolArray, bound: float, workers: Workers
+    chart: WorkingChart, g: ComplexArray, w: ComplexArray, known: BoolArray, aim: float, workers: Workers
 ) -> FloatArray | None:
     """Return an injective map (n, 2) close to the positions w (n,) of some vertices; None if none was found.
 
-    ``g`` (3, f) is as in `NewtonSystem`.
+    ``g`` (3, f) is as in `NewtonSystem`, and ``aim`` the stretch at which the fits end. With the derivatives p and q of
+    the map in each triangle, and targets P and Q, each fit minimises ``Σ area (|p − P|² + |q − Q|²)``: ARAP's global
+    step, with one factorisation of the Laplacian for all fits (Liu et al. 2008). First, Q is 0 and P a rotation.
     """
     F, n = chart.F, len(w)
     corners = np.ascontiguousarray(F.T)
@@ -167,17 +177,18 @@ def _fit(
     turned = unfolding.carry(_direction(p), known[F].all(axis=1) & (np.abs(p) > np.abs(q)))
     if turned is None:
         return None
+    # Up to a factor, which all terms have.
     area = 1 / np.abs((g[1].conj() * g[2]).imag)
     fitted = Laplacian(F, n, np.array([0])).factor(2 * area * (g * g[(1, 2, 0), :].conj()).real)
     w = fitted.respond(sum_at(corners.ravel(), (area * turned * g).ravel(), n))
-    most = 1 + _TUNING.permitted * (bound - 1)
+    most = 1 + _TUNING.permitted * (aim - 1)
     for k in range(_TUNING.most_fits + 1):
         workers.check_wanted()
         p, q = _derivatives(g, w[corners])
         larger, smaller = np.abs(p) + np.abs(q), np.abs(p) - np.abs(q)
         with np.errstate(all="ignore"):
             scale = np.sqrt(area.sum() / (area * larger * smaller).sum())
-        good = (larger * scale < bound) & (smaller * scale * bound > 1)
+        good = (larger * scale < aim) & (smaller * scale * aim > 1)
         enough = area[~good].sum() <= _TUNING.enough * FREE_SHARE * area.sum()
         if k == _TUNING.most_fits or (k >= _TUNING.least_fits and enough):
             break

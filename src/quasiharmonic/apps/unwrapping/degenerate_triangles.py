@@ -270,8 +270,8 @@ def _find_neighbours(points: FloatArray, F: IntArray, flat: IntArray) -> IntArra
     if alone.size:
         from scipy.spatial import KDTree
 
-        _, nearest = KDTree(points[F[:, 0]]).query(points[flat[alone, 0]])
-        neighbour[alone] = nearest
+        distance, corner_number = KDTree(points[F].reshape(-1, points.shape[1])).query(points[flat[alone]])
+        neighbour[alone] = corner_number[np.arange(alone.size), distance.argmin(axis=1)] // 3
     return neighbour
 
 

@@ -137,6 +137,7 @@ class SlidingSystem(NewtonSystem):
         slider = invert_indices(size, self.at)
         row = np.searchsorted(self._indptr, self._side_slots[0], side="right") - 1
         ends = slider[row // 2], slider[self._indices[self._side_slots[0]] // 2]
+        # Each side's block has the slots xx, xy, yx, yy, the x-row of its lower vertex first; see `NewtonSystem`.
         # Slots of blocks with a row of a sliding vertex, and of transposed blocks with a column of one, with the
         # numbers of these vertices.
         both = self._side_slots, self._side_slots[[0, 2, 1, 3]]
@@ -152,6 +153,7 @@ class SlidingSystem(NewtonSystem):
         low, high = np.sort(self.at[pairs], axis=1).T
         column = self._indices[self._side_slots[0]] // 2
         size = self.free.size
+        # Ascending, because the pattern is sorted by row, then by column.
         keys = self._row * size + column
         self._coupled = self._side_slots[0, np.searchsorted(keys, low * size + high)]
         self.coupling = np.zeros(len(pairs))
@@ -175,6 +177,9 @@ class SlidingSystem(NewtonSystem):
 class SlidingModel(MapModel):
     """The model of a Newton descent whose boundary vertices slide on curves; see `MapModel`.
 
+    In each step, `prepare` and `gradient` come first, which choose the tangents, then `assemble`, `restrict` and
+    `search`, which use them.
+
     Parameters
     ----------
     energy : DeformationEnergy
@@ -183,7 +188,7 @@ class SlidingModel(MapModel):
     fixed : (k,) int64
         Fixed vertices; sliding ones are excluded.
     loops : sequence of (l,) int64
-        The boundary, which must not meet itself.
+        The boundary. If it does not meet itself, it stays so.
     exponent, linear_solver
         As in `newton_descent`.
     system : SlidingSystem, optional

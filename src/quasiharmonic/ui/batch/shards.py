@@ -146,7 +146,8 @@ def merge(sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[s
     sources : sequence of paths
         Folders of runs. Each has tables of shards, ``records-i-of-n.csv`` or ``.parquet``, or one table ``records``.
     output : path
-        Folder for the table, ``records.csv`` or ``.parquet``; created if necessary. It may be one of the sources.
+        Folder for the table, ``records.csv`` or ``.parquet``; created if necessary. It may be one of the sources,
+        if that has tables of shards.
     table : {"csv", "parquet"}
         Format of the table.
 
@@ -158,7 +159,7 @@ def merge(sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[s
     Raises
     ------
     ValueError
-        If a folder has no tables, the tables have different settings, the tables belong to different numbers of
+        If there is no folder, a folder has no tables or only that which would be overwritten, the tables have different settings, the tables belong to different numbers of
         shards, or two of them belong to the same shard.
     MeshFileError
         If a table cannot be read.
@@ -197,7 +198,11 @@ def _find_tables(folders: Sequence[Path], target: Path) -> tuple[list[Path], tup
     others = []
     for folder in folders:
         here = {shard: path for path in sorted(folder.glob("records-*")) if (shard := shard_of(path.name)) is not None}
-        whole = [folder / name for name in records.TABLES if (folder / name).exists() and folder != target.parent]
+        whole = [folder / name for name in records.TABLES if (folder / name).exists()]
+        if not here and whole and folder == target.parent:
+            raise ValueError(
+                f"{folder} has one table of all records, which the new one would replace: choose another output"
+            )
         if not here and not whole:
             raise ValueError(f"{folder}: there is no table of records of a finished run or shard")
         for shard, path in here.items():
@@ -205,6 +210,8 @@ def _find_tables(folders: Sequence[Path], target: Path) -> tuple[list[Path], tup
                 raise ValueError(f"{shards[shard]} and {path} belong to the same shard: omit one of the folders")
             shards[shard] = path
         others += [] if here else whole[:1]
+    if not folders:
+        raise ValueError("there is no folder with tables to merge")
     counts = {shard.total for shard in shards}
     if len(counts) > 1:
         numbers = " and ".join(map(str, sorted(counts)))
