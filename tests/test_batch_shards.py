@@ -78,7 +78,7 @@ class TestArray:
         batch.run(source, tmp_path / "out3", batch.Settings(max_iterations=3), jobs=1)
         with pytest.raises(ValueError, match="different settings"):
             batch.merge([tmp_path / "out1", tmp_path / "out3"], tmp_path / "all")
-        with pytest.raises(ValueError, match="out3 has one table of all records, which the new one would replace"):
+        with pytest.raises(ValueError, match="out3 has one table, which the new one would replace"):
             batch.merge([tmp_path / "out3"], tmp_path / "out3")
         with pytest.raises(ValueError, match="no folder with tables"):
             batch.merge([], tmp_path / "all")

@@ -200,9 +200,7 @@ def _find_tables(folders: Sequence[Path], target: Path) -> tuple[list[Path], tup
         here = {shard: path for path in sorted(folder.glob("records-*")) if (shard := shard_of(path.name)) is not None}
         whole = [folder / name for name in records.TABLES if (folder / name).exists()]
         if not here and whole and folder == target.parent:
-            raise ValueError(
-                f"{folder} has one table of all records, which the new one would replace: choose another output"
-            )
+            raise ValueError(f"{folder} has one table, which the new one would replace: choose another output")
         if not here and not whole:
             raise ValueError(f"{folder}: there is no table of records of a finished run or shard")
         for shard, path in here.items():
