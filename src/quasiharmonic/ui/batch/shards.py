@@ -159,8 +159,8 @@ def merge(sources: Sequence[str | os.PathLike[str]], output: str | os.PathLike[s
     Raises
     ------
     ValueError
-        If there is no folder, a folder has no tables or only that which would be overwritten, the tables have different settings, the tables belong to different numbers of
-        shards, or two of them belong to the same shard.
+        If there is no folder, a folder has no tables or only that which would be overwritten, the tables have different
+        settings or belong to different numbers of shards, or two of them belong to the same shard.
     MeshFileError
         If a table cannot be read.
     OutputError
