@@ -456,7 +456,10 @@ def check_bool(name: str, value: Any) -> None:
 
 def _is_non_negative(value: Any) -> bool:
     """Return whether a number is finite and at least zero; integers beyond the range of floats count as infinite."""
-    return bool(0 <= value <= float(np.finfo(np.float64).max))
+    try:
+        return 0 <= float(value) < np.inf
+    except OverflowError:
+        return False
 
 
 def check_weld(value: Any) -> None:

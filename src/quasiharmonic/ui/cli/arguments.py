@@ -52,8 +52,9 @@ def declare_options(operation: type[Options]) -> dict[str, Option]:
 
     Options of base classes are shared, and commands list these last.
     """
-    own = operation.__annotations__
-    return {one.name: _declare(one) for one in fields(operation) if one.name in own and one.metadata["help"]}
+    every = {one.name: one for one in fields(operation)}
+    own = (every[name] for name in operation.__annotations__ if name in every)
+    return {one.name: _declare(one) for one in own if one.metadata["help"]}
 
 
 def _declare(one: Field[Any]) -> Option:
@@ -63,10 +64,12 @@ def _declare(one: Field[Any]) -> Option:
     if choices:
         return choice(choices, words, default=one.default)
     integer = {options.positive: count, options.positive_or_none: count, options.count: steps}.get(check, int)
-    if one.type in ("int", "int | None"):
+    # Types are strings in modules with postponed annotations.
+    kind = one.type if isinstance(one.type, str) else getattr(one.type, "__name__", str(one.type))
+    if kind in ("int", "int | None"):
         return number(integer, words, default=one.default)
-    if one.type not in ("float", "float | None"):
-        raise TypeError(f"the command line has no option of type {one.type}: {one.name}")
+    if kind not in ("float", "float | None"):
+        raise TypeError(f"the command line has no option of type {kind}: {one.name}")
     return number(float, words, metavar="SECONDS" if check is options.seconds else "X", default=one.default)
 
 
