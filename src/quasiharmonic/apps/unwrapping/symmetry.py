@@ -106,9 +106,8 @@ def find_mirror(V: FloatArray, F: IntArray, axis: str) -> tuple[Mirror | None, S
         if mirror is not None:
             return mirror, Symmetry(name, 1.0, True, "")
         if best.axis is None or share > best.share:
-            paired = there.all() and np.array_equal(image[image], np.arange(len(image)))
-            missing = f"not every {'triangle' if paired else 'vertex'} has a mirror image"
-            best = Symmetry(name, share, False, missing + (" of its own" if there.all() and not paired else ""))
+            missing = "not every triangle has a mirror image" if there.all() else "not every vertex has a mirror image"
+            best = Symmetry(name, share, False, missing)
     return None, best
 
 
