@@ -235,6 +235,9 @@ def test_charts_reach_across_vertices_at_equal_positions(visitor, tmp_path):
     assert saved.rings.sizes.tolist() == [4] * len(faces)
     visitor.does("flatten")
     assert visitor.session.state.injective
+    sheet = make_sheet(saved, "loose.obj").clean_up()
+    places = {tuple(map(tuple, np.sort(sheet.surface.V[edge], axis=0))) for edge in sheet.find_edges(faces[:9, :2])}
+    assert places == {tuple(map(tuple, np.sort(saved.V[edge], axis=0))) for edge in faces[:9, :2]}
 
 
 def test_names_of_drawings_are_no_options(visitor):

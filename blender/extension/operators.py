@@ -96,7 +96,7 @@ class UvWorking(Working):
                 f"{count_of('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision. "
             )
         kind = "INFO" if verdict.injective else "WARNING"
-        self.report({kind}, f"{self.label}{remark}{_told(verdict)}{_describe_others(self.surface, stored)}")
+        self.report({kind}, f"{self.label}{remark}{_describe(verdict)}{_describe_others(self.surface, stored)}")
 
 
 class ChosenWorking(UvWorking):
@@ -133,7 +133,7 @@ class QHM_OT_check(UvWorking):
         self._found.append((self.data, self.surface, chosen))
         if len(self._found) == len(self._parts):
             surface.select_faces(context, self._found)
-        text = f"{count_of('face', 'faces', len(chosen))} selected, of which {len(inverted)} inverted. {_told(verdict)}"
+        text = f"{count_of('face', 'faces', len(chosen))} selected, of which {len(inverted)} inverted. " + _describe(verdict)
         if len(bent):
             text += (
                 f" {count_of('face is', 'faces are', len(bent))} not convex: cut into other triangles, some would flip."
@@ -312,12 +312,12 @@ def _require_borders(mesh: SeamedMesh) -> None:
         raise Refused("the mesh, or a part of it, is closed: mark seams, or use Cut and Flatten")
 
 
-def _told(verdict: AtlasVerdict) -> str:
+def _describe(verdict: AtlasVerdict) -> str:
     """Return the first lines of a verdict, joined into one line, and how to turn mirrored islands over."""
-    told = " ".join(verdict.summary().splitlines()[:3])
+    words = " ".join(verdict.summary().splitlines()[:3])
     if verdict.mirrored.size:
-        told += f" {QHM_OT_repair.bl_label} has the option Turn mirrored islands over."
-    return told
+        words += f" {QHM_OT_repair.bl_label} has the option Turn mirrored islands over."
+    return words
 
 
 def _describe_others(here: surface.Surface, stored: SeamedMesh) -> str:

@@ -11,7 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from quasiharmonic.apps.unwrapping.degenerate_triangles import exclude, widen
 from quasiharmonic.apps.unwrapping.sheets import join_sheets
 from quasiharmonic.geometry.mesh.splitting import find_representatives
-from quasiharmonic.geometry.mesh.topology import are_collapsed, boundary_edges, components, edge_keys, pair_keys
+from quasiharmonic.geometry.mesh.topology import (
+    are_collapsed,
+    boundary_edges,
+    components,
+    edge_keys,
+    mark_sides,
+    pair_keys,
+)
 from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.problem.inspection import MeshReport, find_close_vertices, inspect_mesh, tabulate_elements
 from quasiharmonic.util.arrays import (
@@ -159,6 +166,11 @@ class CleanedMesh:
     def take_corners(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
         """Return values at the corners of the cleaned triangles, given those of all triangles of the model."""
         return turn_corners(values[self.triangles], self.flipped)
+
+    def mark_edges(self, edges: IntArray) -> BoolArray:
+        """Return a mask (f', 3) of the sides at edges (k, 2) of the model, by any of the vertices that were merged."""
+        joint = self.representatives
+        return mark_sides(joint[self.corners], joint[edges], len(joint))
 
     def restore_corners(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
         """Return values at the corners of all triangles of the model, such as indices of texture coordinates.

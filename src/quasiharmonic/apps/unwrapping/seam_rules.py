@@ -23,7 +23,6 @@ from quasiharmonic.geometry.mesh.topology import (
     edge_keys,
     find_pairs,
     label_components,
-    mark_sides,
     pair_keys,
 )
 from quasiharmonic.io.seamed_mesh import find_folds
@@ -104,7 +103,7 @@ def find_rules(
         If lists of edges or labels are wrong.
     """
     wanted = _read_wanted_seams(options.seams, options.no_seams, F, cleaned.representatives)
-    demanded, kept = _mark_edges(cleaned, wanted.seams), _mark_edges(cleaned, wanted.no_seams)
+    demanded, kept = cleaned.mark_edges(wanted.seams), cleaned.mark_edges(wanted.no_seams)
     labels = (
         None
         if options.labels is None
@@ -163,7 +162,7 @@ def _mark_hard_edges(given: Any, hinges: Hinges, cleaned: CleanedMesh, F: IntArr
         return np.zeros(cleaned.F.shape, dtype=np.bool_)
     if isinstance(given, Real):
         return hinges.mark_sides(np.abs(hinges.angle) > np.deg2rad(float(given)) + _SAME_ANGLE, len(cleaned.F))
-    return _mark_edges(cleaned, _read_edges("hard_edges", given, F, cleaned.representatives))
+    return cleaned.mark_edges(_read_edges("hard_edges", given, F, cleaned.representatives))
 
 
 def _mirror_sides(sides: BoolArray, hinges: Hinges, mirror: Mirror, F: IntArray) -> BoolArray:
@@ -248,11 +247,6 @@ def _read_edges(name: str, given: ArrayLike | None, F: IntArray, joint: IntArray
     if absent.any():
         raise ValueError(f"{name}: {edge_names(edges[absent])}: not an edge of the mesh")
     return np.unique(merged, axis=0)
-
-
-def _mark_edges(cleaned: CleanedMesh, edges: IntArray) -> BoolArray:
-    """Return a mask (f', 3) of the sides of the cleaned mesh at edges (k, 2), given by representatives."""
-    return mark_sides(cleaned.representatives[cleaned.corners], edges, len(cleaned.representatives))
 
 
 def _extend_seams(V: FloatArray, F: IntArray, hinges: Hinges, demanded: BoolArray, cost: FloatArray) -> BoolArray:

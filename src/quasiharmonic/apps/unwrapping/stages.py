@@ -103,8 +103,7 @@ class Task:
 
     def report(self, phase: str, done: int = 0, total: int = 1) -> None:
         """Call the user's callback."""
-        if self.wanted.callback is not None:
-            self.wanted.callback(UnwrapStep(phase, done, total))
+        _report(self.wanted, phase, done, total)
 
 
 class FoundCharts(NamedTuple):
@@ -127,6 +126,12 @@ class PlacedCharts(NamedTuple):
     certificate: UnwrapCertificate
 
 
+def _report(wanted: UnwrapOptions, phase: str, done: int = 0, total: int = 1) -> None:
+    """Call the callback of the options."""
+    if wanted.callback is not None:
+        wanted.callback(UnwrapStep(phase, done, total))
+
+
 def prepare(V: ArrayLike, F: ArrayLike, options: UnwrapOptions) -> Task:
     """Check the arguments of `unwrap`, clean the model, and find the rules for its seams."""
     V = vertex_array(V)
@@ -137,8 +142,7 @@ def prepare(V: ArrayLike, F: ArrayLike, options: UnwrapOptions) -> Task:
     if corner_uv is not None and np.isnan(corner_uv).all():
         corner_uv = None
     costs = None if wanted.edge_costs is None else side_costs(wanted.edge_costs, len(F))
-    if wanted.callback is not None:
-        wanted.callback(UnwrapStep("clean", 0, 1))
+    _report(wanted, "clean")
     whole = clean(V, F, wanted.outward, weld=wanted.weld, meshes=wanted.meshes)
     exponent = find_exponent(whole.V)
     cleaned, kept = whole, None
@@ -190,7 +194,7 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
         straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, task.bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others, draft.strips = np.flatnonzero(rest), straight, strips
-    # Beside kept charts, there is no telling how long charts may be.
+    # Beside kept charts, it is unknown how long charts may be.
     density = task.density if task.kept is None else None
     divide = partial(divide_long_charts, wanted=wanted, size=task.size, density=density)
     textures = Textures(task.size, float(wanted.padding), wanted.tiles, wanted.rotate)

@@ -14,7 +14,6 @@ import binascii
 import lzma
 import re
 import zlib
-from base64 import b64encode
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -341,4 +340,4 @@ def _encode_array(name: str, values: NDArray[np.generic]) -> str:
     data = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes()
     components = values.shape[1] if values.ndim == 2 else 1
     head = f'<DataArray type="{_TYPES[values.dtype.kind]}" Name="{name}" NumberOfComponents="{components}"'
-    return f'{head} format="binary">{b64encode(len(data).to_bytes(8, "little") + data).decode()}</DataArray>\n'
+    return f'{head} format="binary">{base64.b64encode(len(data).to_bytes(8, "little") + data).decode()}</DataArray>\n'

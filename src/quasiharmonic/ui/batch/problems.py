@@ -155,12 +155,16 @@ def _find_problems_below(
 
 
 def _is_surface(path: Path) -> bool:
-    """Whether a file in a folder is a surface, by its name.
+    """Whether a file in a folder is a surface, by its name. A damaged one is, so that it is reported.
 
     Other files, such as ``lh.thickness``, have names like FreeSurfer's surfaces, so these are known by their content.
     """
-    if path.suffix.lower() in suffixes("read") or not is_surface_name(path) or not path.is_file():
-        return is_surface_name(path)
+    if path.suffix.lower() in suffixes("read"):
+        return True
+    if not is_surface_name(path):
+        return False
+    if not path.is_file():
+        return True
     try:
         with open(path, "rb") as file:
             return file.read(len(_STARTS[-1])).startswith(_STARTS)

@@ -59,9 +59,8 @@ class Operation:
     requires: Callable[[SessionState], None] | None = None  # Check of the selected islands, by RequestError
     of_all: bool = False  # Whether the check concerns all islands, not only the selected ones
     changed_seams: bool = False  # Whether it keeps the seams that the user changed, or cuts along them
-    ahead: bool = (
-        False  # Whether the page has already moved the map, so that step 3 comes first: any error moves it back
-    )
+    # Whether the page has already moved the map, so that step 3 comes first: any error moves it back
+    ahead: bool = False
     fit: bool = False  # Whether the page then shows the whole map
 
     def __call__(self, plan: Planner) -> Callable[[Session, MessageFrame], None]:

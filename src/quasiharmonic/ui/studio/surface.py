@@ -87,6 +87,12 @@ class PageSurface:
             corners = self.cleaned.take_corners(corners)
         return corners[:, (0, 2, 1)] if self.turned else corners
 
+    def find_edges(self, edges: IntArray) -> IntArray:
+        """Return edges (k, 2) of the file's mesh by the vertices of the cleaned surface, where it has them."""
+        assert self.cleaned is not None
+        F, sides = self.cleaned.F, self.cleaned.mark_edges(edges)
+        return np.unique(np.sort(np.stack([F[sides], F[:, (1, 2, 0)][sides]], axis=1), axis=1), axis=0)
+
     def mapped_file(self, mesh: SeamedMesh) -> io.MeshData:
         """Return the file's mesh with a map of the surface, turned over if the surface is.
 

@@ -64,22 +64,13 @@ def unwrap_model(
     if from_file and sheet.is_file and len(np.unique(V[used], axis=0)) < len(used):
         # Charts reach across vertices at equal positions, so these become one.
         sheet = sheet.clean_up()
-        state = replace(state, sheet=sheet, forbidden=_find_edges(sheet, state.forbidden))
+        state = replace(state, sheet=sheet, forbidden=sheet.find_edges(state.forbidden))
     FT = sheet.from_file(result.indices) if from_file else result.indices
     mapped = SeamedMesh(sheet.surface.V, sheet.surface.F, FT, result.uvs)
     # A call that was stopped cannot be repeated.
     stopped = result.status is UnwrapStatus.TIME_LIMIT
     recipe = record_start(mapped) if stopped else _record_unwrap(source, options)
     return replace(rebuild_from_mesh(state, mapped, recipe), from_file=False).select_all()
-
-
-def _find_edges(sheet: PageSurface, edges: IntArray) -> IntArray:
-    """Return edges (k, 2) of the file's mesh by the vertices of a cleaned surface, without those that it lacks."""
-    F = sheet.surface.F
-    number = np.zeros(len(sheet.mesh.V), dtype=np.int64)
-    number[sheet.from_file(sheet.mesh.F)] = F
-    found = number[edges]
-    return found[are_sides(found, F, len(sheet.surface.V))]
 
 
 def _keep_parts(state: SessionState, keep_seams: bool, selected: bool) -> dict[str, Given]:

@@ -61,8 +61,10 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
             lost.append("tangents, because the texture coordinates changed")
         lost += [f"the image {name}, which is not an image file in the folder of {mesh.source}" for name in missing]
         return lost
-    lost += [] if isinstance(carried, CarriedGltf) else ["digits beyond single precision"]
-    lost += [] if carried is None else carried.further()
+    if not isinstance(carried, CarriedGltf):
+        lost.append("digits beyond single precision")
+    if carried is not None:
+        lost += carried.further()
     with np.errstate(over="ignore"):
         apart = len(np.unique(mesh.V.astype(np.float32), axis=0))
     if apart < len(mesh.V):
