@@ -133,7 +133,8 @@ class QHM_OT_check(UvWorking):
         self._found.append((self.data, self.surface, chosen))
         if len(self._found) == len(self._parts):
             surface.select_faces(context, self._found)
-        text = f"{count_of('face', 'faces', len(chosen))} selected, of which {len(inverted)} inverted. " + _describe(verdict)
+        text = f"{count_of('face', 'faces', len(chosen))} selected, of which {len(inverted)} inverted. "
+        text += _describe(verdict)
         if len(bent):
             text += (
                 f" {count_of('face is', 'faces are', len(bent))} not convex: cut into other triangles, some would flip."
