@@ -9,8 +9,6 @@
 typedef struct {
     int64_t rows, columns, words, levels;
     uint64_t *near;
-    /* Number of occupied cells before each word of a row. */
-    int32_t *before;
 } Board;
 
 /* A run of cells of a bitmap: its row, first column and end, and two places from where the bits of a board say which of
@@ -19,11 +17,17 @@ typedef struct {
     int64_t row, first, end, words[2], bits[2];
 } Run;
 
-/* A bitmap: the longest runs first. By a shift of one row at most `rise` cells leave it, by one column at most one for
- * each run. */
+/* Cells beside a bitmap, as numbers of bits of a board from the bitmap's place on. */
+typedef struct {
+    int64_t count, *bits;
+} Cells;
+
+/* A bitmap: the longest runs first, and the cells that it would cover in addition if it was shifted by one cell: to the
+ * right, to the left, up and down. */
 typedef struct {
     const Run *runs;
-    int64_t count, height, width, rise;
+    int64_t count, height, width;
+    Cells beside[4];
 } Bitmap;
 
 static uint64_t *row_of(const Board *board, int64_t level, int64_t row)
@@ -38,14 +42,6 @@ static uint64_t bits_from(const uint64_t *row, int64_t words, int64_t bit)
     if (word >= words)
         return 0;
     return row[word] >> shift | row[word + 1] << 1 << (63 - shift);
-}
-
-static int64_t count_bits(uint64_t bits)
-{
-    bits -= bits >> 1 & 0x5555555555555555u;
-    bits = (bits & 0x3333333333333333u) + (bits >> 2 & 0x3333333333333333u);
-    bits = (bits + (bits >> 4)) & 0x0f0f0f0f0f0f0f0fu;
-    return (int64_t)(bits * 0x0101010101010101u >> 56);
 }
 
 /* Which of eight cells are occupied, the first one in the lowest bit. */
@@ -68,16 +64,11 @@ static void read_board(Board *board, const unsigned char *cells)
     for (int64_t i = 0; i < board->rows; i++) {
         const unsigned char *from = cells + i * board->columns;
         uint64_t *row = row_of(board, 0, i);
-        int32_t *before = board->before + i * (words + 1), sum = 0;
         int64_t j = 0;
         for (; j + 8 <= board->columns; j += 8)
             row[j / 64] |= read_eight(from + j) << j % 64;
         for (; j < board->columns; j++)
             row[j / 64] |= (uint64_t)(from[j] != 0) << j % 64;
-        for (int64_t w = 0; w <= words; w++) {
-            before[w] = sum;
-            sum += (int32_t)count_bits(row[w]);
-        }
     }
     for (int64_t level = 1; level < board->levels; level++)
         for (int64_t i = 0; i < board->rows; i++) {
@@ -101,23 +92,53 @@ static void read_runs(const Board *board, const int64_t *given, int64_t count, R
     }
 }
 
-/* The number of a bitmap's cells that have no cell of it above. `cells` has room for all rows of the board. */
-static int64_t count_rise(const Bitmap *bitmap, uint64_t *cells)
+/* The largest number of cells of a bitmap. */
+static int64_t count_most_cells(const int64_t *runs, const int64_t *starts, int64_t bitmaps)
 {
-    const int64_t words = bitmap->width / 64 + 1, size = bitmap->height * words;
-    int64_t count = 0;
-    memset(cells, 0, (size_t)(size + words) * sizeof(*cells));
+    int64_t most = 0;
+    for (int64_t k = 0; k < bitmaps; k++) {
+        int64_t count = 0;
+        for (int64_t run = starts[k]; run < starts[k + 1]; run++)
+            count += runs[3 * run + 2] - runs[3 * run + 1];
+        most = count > most ? count : most;
+    }
+    return most;
+}
+
+static void add_cell(Cells *cells, int64_t bit)
+{
+    cells->bits[cells->count++] = bit;
+}
+
+/* List the cells beside a bitmap. `cells` has room for all rows of the board and two more, and each list for all cells
+ * of the bitmap. */
+static void list_beside(const Board *board, Bitmap *bitmap, uint64_t *cells)
+{
+    const int64_t words = bitmap->width / 64 + 1, stride = 64 * (board->words + 1);
+    uint64_t *rows = cells + words;
+    memset(cells, 0, (size_t)((bitmap->height + 2) * words) * sizeof(*cells));
+    for (int k = 0; k < 4; k++)
+        bitmap->beside[k].count = 0;
     for (int64_t k = 0; k < bitmap->count; k++) {
         const Run *run = bitmap->runs + k;
-        uint64_t *row = cells + run->row * words;
+        add_cell(&bitmap->beside[0], run->row * stride + run->end);
+        add_cell(&bitmap->beside[1], run->row * stride + run->first - 1);
+        uint64_t *row = rows + run->row * words;
         for (int64_t w = run->first / 64; w <= run->end / 64; w++) {
             const uint64_t from = w == run->first / 64 ? ~(uint64_t)0 << run->first % 64 : ~(uint64_t)0;
             row[w] |= w == run->end / 64 ? from & (((uint64_t)1 << run->end % 64) - 1) : from;
         }
     }
-    for (int64_t w = 0; w < size; w++)
-        count += count_bits(cells[w] & ~cells[w + words]);
-    return count;
+    for (int64_t i = 0; i < bitmap->height; i++)
+        for (int64_t w = 0; w < words; w++) {
+            const uint64_t *here = rows + i * words + w;
+            for (int up = 0; up < 2; up++) {
+                uint64_t bits = *here & ~here[up ? words : -words];
+                for (int64_t j = 64 * w; bits; bits >>= 1, j++)
+                    if (bits & 1)
+                        add_cell(&bitmap->beside[up ? 2 : 3], (i + (up ? 1 : -1)) * stride + j);
+            }
+        }
 }
 
 /* Mark the columns of a row where a bitmap would overlap occupied cells. */
@@ -138,38 +159,13 @@ static void find_collisions(const Board *board, const Bitmap *bitmap, int64_t ro
     }
 }
 
-/* The number of occupied cells of a row before a column. */
-static int64_t count_before(const Board *board, int64_t row, int64_t column)
-{
-    const int64_t word = column / 64;
-    const uint64_t bits = row_of(board, 0, row)[word] & (((uint64_t)1 << column % 64) - 1);
-    return board->before[row * (board->words + 1) + word] + count_bits(bits);
-}
-
-/* The number of a bitmap's cells that would be in occupied cells. */
-static int64_t count_overlap(const Board *board, const Bitmap *bitmap, int64_t row, int64_t column)
+/* The number of cells beside a bitmap that are occupied, if it is more than `least`; otherwise this or a lower number. */
+static int64_t count_occupied(const Board *board, Cells beside, int64_t place, int64_t least)
 {
     int64_t sum = 0;
-    for (int64_t k = 0; k < bitmap->count; k++) {
-        const Run *run = bitmap->runs + k;
-        const int64_t length = run->end - run->first, here = row + run->row;
-        if (length < 64) {
-            const uint64_t bits = bits_from(row_of(board, 0, here), board->words, column + run->first);
-            sum += count_bits(bits & (((uint64_t)1 << length) - 1));
-        } else
-            sum += count_before(board, here, column + run->end) - count_before(board, here, column + run->first);
-    }
-    return sum;
-}
-
-/* The number of a bitmap's runs that have an occupied cell beside them, after the end or before the first cell. */
-static int64_t count_beside(const Board *board, const Bitmap *bitmap, int64_t row, int64_t column, int after)
-{
-    int64_t sum = 0;
-    for (int64_t k = 0; k < bitmap->count; k++) {
-        const Run *run = bitmap->runs + k;
-        const int64_t cell = column + (after ? run->end : run->first - 1);
-        sum += (int64_t)(row_of(board, 0, row + run->row)[cell / 64] >> cell % 64 & 1);
+    for (int64_t k = 0; k < beside.count && sum + beside.count - k > least; k++) {
+        const uint64_t bit = (uint64_t)(place + beside.bits[k]);
+        sum += (int64_t)(board->near[bit / 64] >> bit % 64 & 1);
     }
     return sum;
 }
@@ -179,7 +175,7 @@ static int64_t count_beside(const Board *board, const Bitmap *bitmap, int64_t ro
 static int64_t find_place(const Board *board, const Bitmap *bitmap, int64_t least, uint64_t *three, int64_t *place)
 {
     const int64_t last_row = board->rows - bitmap->height, last_column = board->columns - bitmap->width;
-    const int64_t words = board->words + 1, side = bitmap->count, rise = bitmap->rise;
+    const int64_t words = board->words + 1;
     int64_t best = least;
     uint64_t *below = three, *here = three + words, *above = three + 2 * words;
     find_collisions(board, bitmap, 0, below);
@@ -203,16 +199,14 @@ static int64_t find_place(const Board *board, const Bitmap *bitmap, int64_t leas
                 /* Shifts by one cell that are not free; each one has at most this contact. */
                 const int shifts[] = {right >> j % 64 & 1, left >> j % 64 & 1, above[w] >> j % 64 & 1,
                                       below[w] >> j % 64 & 1};
-                const int64_t most[] = {side, side, rise, rise};
                 int64_t contact = 0;
                 for (int k = 0; k < 4; k++)
-                    contact += shifts[k] ? most[k] : 0;
+                    contact += shifts[k] ? bitmap->beside[k].count : 0;
                 for (int k = 0; k < 4 && contact > best; k++) {
                     if (!shifts[k])
                         continue;
-                    contact -= most[k];
-                    contact += k < 2 ? count_beside(board, bitmap, i, j, k == 0)
-                                     : count_overlap(board, bitmap, i + (k == 2 ? 1 : -1), j);
+                    contact -= bitmap->beside[k].count;
+                    contact += count_occupied(board, bitmap->beside[k], 64 * words * i + j, best - contact);
                 }
                 if (contact > best) {
                     best = contact;
@@ -245,20 +239,21 @@ static PyObject *find_contact(PyObject *module, PyObject *const *given, Py_ssize
     const int64_t *starts = a[3].data, *sizes = a[4].data;
     int64_t *spot = a[5].data;
     const int64_t columns = a[0].size / rows;
-    Board board = {rows, columns, (columns + 63) / 64, 1, NULL, NULL};
+    Board board = {rows, columns, (columns + 63) / 64, 1, NULL};
     while ((int64_t)1 << board.levels <= columns)
         board.levels++;
     board.near = malloc((size_t)(board.levels * rows * (board.words + 1)) * sizeof(*board.near));
-    board.before = malloc((size_t)(rows * (board.words + 1)) * sizeof(*board.before));
     uint64_t *three = malloc((size_t)(3 * (board.words + 1)) * sizeof(*three));
-    uint64_t *cells = malloc((size_t)(rows * board.words) * sizeof(*cells));
+    uint64_t *cells = malloc((size_t)((rows + 2) * board.words) * sizeof(*cells));
     Run *runs = malloc((size_t)(a[2].size / 3 + 1) * sizeof(*runs));
-    if (!board.near || !board.before || !three || !cells || !runs) {
+    const int64_t most = count_most_cells(a[2].data, starts, bitmaps);
+    int64_t *beside = malloc((size_t)(4 * most + 1) * sizeof(*beside));
+    if (!board.near || !three || !cells || !runs || !beside) {
         free(board.near);
-        free(board.before);
         free(three);
         free(cells);
         free(runs);
+        free(beside);
         return out_of_memory(a, LENGTH(a));
     }
     int found = 0;
@@ -267,11 +262,13 @@ static PyObject *find_contact(PyObject *module, PyObject *const *given, Py_ssize
     read_runs(&board, a[2].data, a[2].size / 3, runs);
     double best = -1;
     for (Py_ssize_t k = 0; k < bitmaps; k++) {
-        Bitmap bitmap = {runs + starts[k], starts[k + 1] - starts[k], sizes[2 * k], sizes[2 * k + 1], 0};
+        Bitmap bitmap = {runs + starts[k], starts[k + 1] - starts[k], sizes[2 * k], sizes[2 * k + 1], {{0, NULL}}};
         const double sides = (double)(bitmap.height + bitmap.width);
         if (bitmap.height + 2 > rows || bitmap.width + 2 > columns)
             continue;
-        bitmap.rise = count_rise(&bitmap, cells);
+        for (int side = 0; side < 4; side++)
+            bitmap.beside[side].bits = beside + side * most;
+        list_beside(&board, &bitmap, cells);
         // A bitmap with this contact or less is not better than the ones before.
         int64_t least = (int64_t)(best * sides), place[2] = {0, 0};
         while (least >= 0 && (double)least / sides > best)
@@ -288,10 +285,10 @@ static PyObject *find_contact(PyObject *module, PyObject *const *given, Py_ssize
     }
     Py_END_ALLOW_THREADS
     free(board.near);
-    free(board.before);
     free(three);
     free(cells);
     free(runs);
+    free(beside);
     return done_with_integer(a, LENGTH(a), found);
 }
 
