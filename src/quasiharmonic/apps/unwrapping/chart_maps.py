@@ -1,8 +1,10 @@
 """Flatten one chart with a free boundary, and measure its stretch.
 
-The symmetric Dirichlet energy is a mean, so it accepts much stretch in few triangles. If more of the chart than allowed
-is stretched beyond the bound, the descent continues with `EvenStretch`, which weights large stretch more. The boundary
-is not guarded against overlaps. A chart that overlaps itself is divided by the caller, which also lowers its stretch.
+First, the map is fitted to triangles with little stretch (`Fits`): one factorisation for all fits. Where that is not
+enough, Newton's method lowers the symmetric Dirichlet energy. This is a mean, so it accepts much stretch in few
+triangles. If more of the chart than allowed is stretched beyond the bound, the descent continues with `EvenStretch`,
+which weights large stretch more. The boundary is not guarded against overlaps. A chart that overlaps itself is divided
+by the caller, which also lowers its stretch.
 """
 
 from __future__ import annotations
@@ -20,13 +22,16 @@ from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import descend_on_patches
+from quasiharmonic.apps.unwrapping.fits import FIT_TUNING, Fits, limit_stretch
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, Energy, Isotropic, SymmetricDirichlet
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
+from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_complex, to_points
 from quasiharmonic.util.options import FlattenOptions
 
 #: No triangle may be stretched more than this, except triangles with a smaller angle than `THIN_ANGLE`.
@@ -54,6 +59,16 @@ class ChartTuning(NamedTuple):
     least_energy: float = 0.1
     # From mean energies below this, Newton steps are used directly.
     near: float = 1.0
+    # Fits end when one lowers the share over the bound by less than this factor.
+    slow_fit: float = 0.9
+    # After fits, a larger multiple of the free share over the bound is not lowered by a descent.
+    hopeless: float = 2.0
+    # Fits after those permit this share of the stretch that the bound permits.
+    permitted: float = 0.5
+    # Descents follow on fits with more stretch than this, also if the bound permits it.
+    little: float = 1.3
+    # Least number of fits after those to rotations.
+    least_fits: int = 3
     # Boundary vertices are rounded to this multiple of the root of the area before contacts are sought.
     gap: float = 2.0**-20
 
@@ -187,6 +202,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
     ``check_wanted`` is called before every step and may raise an exception. If no injective map is found in double
     precision, the chart has no map.
     """
+    fitted = False
     if chart.uv is None:
         flat = chart.piece.planar_map()
         uv = flat if flat is not None else chart.start if chart.start is not None else _initial_map(chart.piece)
@@ -196,22 +212,27 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
         chart.use(uv)
         if chart.start is not None:
             _relax_long(chart, bound)
-        if flat is None and (chart.start is None or chart.too_long.any()):
+        elif flat is None:
+            fitted = _fit(chart, bound, FIT_TUNING.most_fits, check_wanted) and _is_good(chart, bound)
+        if flat is None and not fitted and (chart.start is None or chart.too_long.any()):
             _descend(chart, SymmetricDirichlet(), check_wanted)
-            _relax_long(chart, bound)
+        _relax_long(chart, bound)
         if keeps_bound(chart, bound):
             return
     else:
         chart.use(chart.uv)
         if chart.bijective and keeps_bound(chart, bound):
             return
-    before, good = chart.uv, chart.bijective and keeps_bound(chart, bound)
-    try:
+        # Fits would leave the map of a chart that only overlaps itself.
+        fitted = not keeps_bound(chart, bound) and _fit(chart, bound, 0, check_wanted)
+        if fitted:
+            _relax_long(chart, bound)
+            if _is_good(chart, bound):
+                return
+            fitted = not keeps_bound(chart, bound)
+    # Where much of the chart exceeds the bound after fits, only cuts help.
+    if not fitted or chart.too_long.any() or chart.share_over(bound) <= _TUNING.hopeless * FREE_SHARE:
         _descend(chart, EvenStretch(bound), check_wanted)
-    finally:
-        if good and not (chart.bijective and keeps_bound(chart, bound)):
-            assert before is not None
-            chart.use(before)
 
 
 def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None:
@@ -226,6 +247,11 @@ def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None
 def keeps_bound(chart: WorkingChart, bound: float) -> bool:
     """Whether a chart on its own keeps the bound."""
     return chart.share_over(bound) <= FREE_SHARE and not chart.too_long.any()
+
+
+def _is_good(chart: WorkingChart, bound: float) -> bool:
+    """Whether a map needs no descent after fits: bijective, with little stretch even if more is permitted."""
+    return chart.bijective and keeps_bound(chart, min(bound, _TUNING.little))
 
 
 def _initial_map(piece: Piece) -> FloatArray | None:
@@ -256,6 +282,37 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
     finally:
         # After a time limit, the chart has the map so far.
         chart.use(descent.uv)
+
+
+def _fit(chart: WorkingChart, bound: float, rotated: int, check_wanted: Callable[[], object]) -> bool:
+    """Use the map after fits, of which the first ones are to rotations, and return True; False if it is not injective.
+
+    They end when the map keeps the bound, or hardly changes.
+    """
+    assert chart.uv is not None
+    w, before = to_complex(chart.uv), np.inf
+    try:
+        fits = Fits(chart.F, chart.piece.energy(SymmetricDirichlet(), None).g)
+        for k in range(FIT_TUNING.most_fits):
+            check_wanted()
+            p, q = fits.derivatives(w)
+            over = fits.share_over(p, q, bound)
+            if k >= _TUNING.least_fits and over <= FIT_TUNING.enough * FREE_SHARE:
+                break
+            slow = over > _TUNING.slow_fit * before and over > _TUNING.hopeless * FREE_SHARE
+            if k >= _TUNING.least_fits + (FIT_TUNING.rotated_fits if rotated else 0) and slow:
+                break
+            before = over
+            permitted = 1.0 if k < rotated else 1 + _TUNING.permitted * (bound - 1)
+            target_p, target_q = limit_stretch(p, q, permitted)
+            w = w + fits.place(target_p - p, target_q - q)
+    except NotPositiveDefinite:
+        return False
+    uv = to_points(w)
+    if not is_injective(chart.F, uv):
+        return False
+    chart.use(uv)
+    return True
 
 
 def _relax_long(chart: WorkingChart, bound: float) -> None:

@@ -179,7 +179,12 @@ def search_charts(
             if goal < bound and room <= 0 and any(stretched for _, stretched in chosen):
                 break
             jobs = [
-                _Job(here[k], stretched, rank < room or (max_charts is None and not here[k].bijective))
+                _Job(
+                    here[k],
+                    stretched,
+                    divisible=rank < room or (max_charts is None and not here[k].bijective),
+                    halved=max_charts is not None,
+                )
                 for rank, (k, stretched) in enumerate(chosen)
             ]
             found = workers.map("improve", partial(_improve, goal, workers, joinable), jobs)
@@ -198,11 +203,14 @@ def search_charts(
 
 
 class _Job(NamedTuple):
-    """A chart to improve; whether it exceeds the bound on stretch; whether it may be divided."""
+    """A chart to improve."""
 
     chart: WorkingChart
+    # Whether it exceeds the bound on stretch.
     stretched: bool
+    # Whether it may be divided, and whether only into two parts.
     divisible: bool
+    halved: bool
 
 
 def _select(charts: Sequence[WorkingChart], bound: float, total_area: float) -> list[tuple[int, bool]]:
@@ -297,4 +305,6 @@ def _improve(bound: float, workers: Workers, joinable: bool, job: _Job) -> tuple
     if not job.divisible or len(chart.F) < 2:
         return [chart], True
     parts = divide(chart, bound) if apart or not len(chart.crossings) else divide_overlap(chart)
+    if job.halved and len(parts) > 2:
+        return [chart], True
     return [done for part in parts for done in _flatten(bound, workers, part)], False
