@@ -61,7 +61,7 @@ class ChartTuning(NamedTuple):
     near: float = 1.0
     # Fits end when one lowers the share over the bound by less than this factor.
     slow_fit: float = 0.9
-    # After fits, a larger multiple of the free share over the bound is not lowered by a descent.
+    # A larger multiple of the free share over the bound is not lowered by a further descent.
     hopeless: float = 2.0
     # Fits after those permit this share of the stretch that the bound permits.
     permitted: float = 0.5
@@ -202,7 +202,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
     ``check_wanted`` is called before every step and may raise an exception. If no injective map is found in double
     precision, the chart has no map.
     """
-    fitted = False
+    improved = True
     if chart.uv is None:
         flat = chart.piece.planar_map()
         uv = flat if flat is not None else chart.start if chart.start is not None else _initial_map(chart.piece)
@@ -210,28 +210,32 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
             chart.stretch = np.full(len(chart.F), np.inf)
             return
         chart.use(uv)
+        good = flat is not None
         if chart.start is not None:
             _relax_long(chart, bound)
-        elif flat is None:
-            fitted = _fit(chart, bound, FIT_TUNING.most_fits, check_wanted) and _is_good(chart, bound)
-        if flat is None and not fitted and (chart.start is None or chart.too_long.any()):
+            good = good or not chart.too_long.any()
+        elif not good:
+            good = _fit(chart, bound, FIT_TUNING.most_fits, check_wanted) and _is_good(chart, bound)
+        if not good:
             _descend(chart, SymmetricDirichlet(), check_wanted)
-        _relax_long(chart, bound)
+            _relax_long(chart, bound)
         if keeps_bound(chart, bound):
             return
     else:
         chart.use(chart.uv)
-        if chart.bijective and keeps_bound(chart, bound):
-            return
-        # Fits would leave the map of a chart that only overlaps itself.
-        fitted = not keeps_bound(chart, bound) and _fit(chart, bound, 0, check_wanted)
-        if fitted:
-            _relax_long(chart, bound)
-            if _is_good(chart, bound):
+        if keeps_bound(chart, bound):
+            if chart.bijective:
                 return
-            fitted = not keeps_bound(chart, bound)
-    # Where much of the chart exceeds the bound after fits, only cuts help.
-    if not fitted or chart.too_long.any() or chart.share_over(bound) <= _TUNING.hopeless * FREE_SHARE:
+            # Fits would leave the map of a chart that only overlaps itself.
+            improved = False
+        else:
+            improved = _fit(chart, bound, 0, check_wanted)
+            _relax_long(chart, bound)
+            if improved and _is_good(chart, bound):
+                return
+    # Where much of the chart exceeds the bound, only cuts help.
+    hopeless = improved and chart.share_over(bound) > _TUNING.hopeless * FREE_SHARE
+    if not hopeless or chart.too_long.any():
         _descend(chart, EvenStretch(bound), check_wanted)
 
 
