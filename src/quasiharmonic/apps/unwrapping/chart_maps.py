@@ -215,7 +215,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
             _relax_long(chart, bound)
             good = good or not chart.too_long.any()
         elif not good:
-            good = _fit(chart, bound, FIT_TUNING.most_fits, check_wanted) and _is_good(chart, bound)
+            good = _fit(chart, bound, FIT_TUNING.most_fits, check_wanted) and _finish_fit(chart, bound, check_wanted)
         if not good:
             _descend(chart, SymmetricDirichlet(), check_wanted)
             _relax_long(chart, bound)
@@ -231,7 +231,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
         else:
             improved = _fit(chart, bound, 0, check_wanted)
             _relax_long(chart, bound)
-            if improved and _is_good(chart, bound):
+            if improved and _finish_fit(chart, bound, check_wanted):
                 return
     # Where much of the chart exceeds the bound, only cuts help.
     hopeless = improved and chart.share_over(bound) > _TUNING.hopeless * FREE_SHARE
@@ -253,9 +253,19 @@ def keeps_bound(chart: WorkingChart, bound: float) -> bool:
     return chart.share_over(bound) <= FREE_SHARE and not chart.too_long.any()
 
 
-def _is_good(chart: WorkingChart, bound: float) -> bool:
-    """Whether a map needs no descent after fits: bijective, with little stretch even if more is permitted."""
-    return chart.bijective and keeps_bound(chart, min(bound, _TUNING.little))
+def _finish_fit(chart: WorkingChart, bound: float, check_wanted: Callable[[], object]) -> bool:
+    """Lower the stretch after fits by one step; return False if the map needs a descent.
+
+    It needs none if it is bijective, with little stretch even if more is permitted.
+    """
+    fitted, little = chart.uv, min(bound, _TUNING.little)
+    if not (chart.bijective and keeps_bound(chart, little)):
+        return False
+    _descend(chart, SymmetricDirichlet(), check_wanted, 1)
+    if not (chart.bijective and keeps_bound(chart, little)):
+        assert fitted is not None
+        chart.use(fitted)
+    return True
 
 
 def _initial_map(piece: Piece) -> FloatArray | None:
@@ -269,7 +279,9 @@ def _initial_map(piece: Piece) -> FloatArray | None:
 
 
 @np.errstate(all="ignore")
-def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> None:
+def _descend(
+    chart: WorkingChart, density: Energy, check_wanted: Callable[[], object], steps: int = _TUNING.max_steps
+) -> None:
     """Lower an energy of the chart's map, which stays injective."""
     assert chart.uv is not None
     value = chart.piece.energy(density, None).value(in_units(chart.uv, 0))
@@ -278,7 +290,7 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
     descent = SurfaceDescent(energy, chart.uv, "auto")
     before = np.inf
     try:
-        for _ in itertools.islice(descend(descent, density, _TUNING.tolerance), _TUNING.max_steps):
+        for _ in itertools.islice(descend(descent, density, _TUNING.tolerance), steps):
             check_wanted()
             if descent.distortion < _TUNING.nothing or descent.distortion > (1 - _TUNING.slow) * before:
                 break
