@@ -63,17 +63,28 @@ class ChartTuning(NamedTuple):
     slow_fit: float = 0.9
     # A larger multiple of the free share over the bound is not lowered by a further descent.
     hopeless: float = 2.0
-    # Fits after those permit this share of the stretch that the bound permits.
-    permitted: float = 0.5
     # Descents follow on fits with more stretch than this, also if the bound permits it.
     little: float = 1.3
-    # Least number of fits after those to rotations.
+    # Least number of fits.
     least_fits: int = 3
     # Boundary vertices are rounded to this multiple of the root of the area before contacts are sought.
     gap: float = 2.0**-20
 
 
 _TUNING = ChartTuning()
+
+
+class _Fitting(NamedTuple):
+    """How a map is fitted."""
+
+    # Fits permit this share of the stretch that the bound permits. With 0, they are to rotations.
+    permitted: float
+    # Number of fits after which slow ones end.
+    patience: int
+
+
+# From a map that is far from the final one, and from one that is near.
+_FROM_AFAR, _FROM_NEAR = _Fitting(0.0, 7), _Fitting(0.5, 3)
 
 
 class EvenStretch(Isotropic):
@@ -215,7 +226,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
             _relax_long(chart, bound)
             good = good or not chart.too_long.any()
         elif not good:
-            good = _fit(chart, bound, FIT_TUNING.most_fits, check_wanted) and _finish_fit(chart, bound, check_wanted)
+            good = _fit(chart, bound, _FROM_AFAR, check_wanted) and _finish_fit(chart, bound, check_wanted)
         if not good:
             _descend(chart, SymmetricDirichlet(), check_wanted)
             _relax_long(chart, bound)
@@ -229,7 +240,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
             # Fits would leave the map of a chart that only overlaps itself.
             improved = False
         else:
-            improved = _fit(chart, bound, 0, check_wanted)
+            improved = _fit(chart, bound, _FROM_NEAR, check_wanted)
             _relax_long(chart, bound)
             if improved and _finish_fit(chart, bound, check_wanted):
                 return
@@ -300,13 +311,14 @@ def _descend(
         chart.use(descent.uv)
 
 
-def _fit(chart: WorkingChart, bound: float, rotated: int, check_wanted: Callable[[], object]) -> bool:
-    """Use the map after fits, of which the first ones are to rotations, and return True; False if it is not injective.
+@np.errstate(all="ignore")
+def _fit(chart: WorkingChart, bound: float, tuning: _Fitting, check_wanted: Callable[[], object]) -> bool:
+    """Use the map after fits, and return True; False if it is not injective.
 
     They end when the map keeps the bound, or hardly changes.
     """
     assert chart.uv is not None
-    w, before = to_complex(chart.uv), np.inf
+    w, before, permitted = to_complex(chart.uv), np.inf, 1 + tuning.permitted * (bound - 1)
     try:
         fits = Fits(chart.F, chart.piece.energy(SymmetricDirichlet(), None).g)
         for k in range(FIT_TUNING.most_fits):
@@ -316,16 +328,15 @@ def _fit(chart: WorkingChart, bound: float, rotated: int, check_wanted: Callable
             if k >= _TUNING.least_fits and over <= FIT_TUNING.enough * FREE_SHARE:
                 break
             slow = over > _TUNING.slow_fit * before and over > _TUNING.hopeless * FREE_SHARE
-            if k >= _TUNING.least_fits + (FIT_TUNING.rotated_fits if rotated else 0) and slow:
+            if k >= tuning.patience and slow:
                 break
             before = over
-            permitted = 1.0 if k < rotated else 1 + _TUNING.permitted * (bound - 1)
             target_p, target_q = limit_stretch(p, q, permitted)
             w = w + fits.place(target_p - p, target_q - q)
     except NotPositiveDefinite:
         return False
     uv = to_points(w)
-    if not is_injective(chart.F, uv):
+    if not np.isfinite(uv).all() or not is_injective(chart.F, uv):
         return False
     chart.use(uv)
     return True

@@ -38,6 +38,10 @@ from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntAr
 class StartTuning(NamedTuple):
     """Numbers that tune how initial maps are fitted and repaired."""
 
+    # Number of fits to rotations. Later fits permit some stretch.
+    rotated_fits: int = 4
+    # A later fit permits this share of the stretch that the aim permits.
+    permitted: float = 0.5
     # Least number of fits after the first one, after which they stop when the aim is reached.
     least_fits: int = 6
     # A triangle whose singular values have a smaller ratio gets a new rotation.
@@ -161,7 +165,7 @@ def _fit(
     if turned is None:
         return None
     w = fits.place(turned, np.zeros_like(turned))
-    most = 1 + FIT_TUNING.permitted * (aim - 1)
+    most = 1 + _TUNING.permitted * (aim - 1)
     for k in range(FIT_TUNING.most_fits + 1):
         workers.check_wanted()
         p, q = fits.derivatives(w)
@@ -169,7 +173,7 @@ def _fit(
         if k == FIT_TUNING.most_fits or (k >= _TUNING.least_fits and enough):
             break
         # At first the targets are rotations, then the nearest matrices with little stretch.
-        target_p, target_q = limit_stretch(p, q, 1.0 if k < FIT_TUNING.rotated_fits else most)
+        target_p, target_q = limit_stretch(p, q, 1.0 if k < _TUNING.rotated_fits else most)
         larger, smaller = singular_values(p, q)
         collapsed = smaller <= _TUNING.least_ratio * larger
         if collapsed.any():

@@ -23,14 +23,10 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, sum_at
 class FitTuning(NamedTuple):
     """Numbers that tune successive fits of a map."""
 
-    # Number of fits to rotations, from a map that is far from the final one. Later fits permit some stretch.
-    rotated_fits: int = 4
     # Largest number of fits.
     most_fits: int = 16
     # The aim counts as reached if at most this part of the free share exceeds it: repairs may stretch a little more.
     enough: float = 0.5
-    # A later fit permits this share of the stretch that the aim permits.
-    permitted: float = 0.5
 
 
 FIT_TUNING = FitTuning()

@@ -98,8 +98,11 @@ static int64_t count_most_cells(const int64_t *runs, const int64_t *starts, int6
     int64_t most = 0;
     for (int64_t k = 0; k < bitmaps; k++) {
         int64_t count = 0;
-        for (int64_t run = starts[k]; run < starts[k + 1]; run++)
-            count += runs[3 * run + 2] - runs[3 * run + 1];
+        for (int64_t run = starts[k]; run < starts[k + 1]; run++) {
+            const int64_t length = runs[3 * run + 2] - runs[3 * run + 1];
+            /* Each run has two cells beside it, even if it had none itself. */
+            count += length > 1 ? length : 1;
+        }
         most = count > most ? count : most;
     }
     return most;
