@@ -84,7 +84,7 @@ class _Fitting(NamedTuple):
 
 
 # From a map that is far from the final one, and from one that is near.
-_FROM_AFAR, _FROM_NEAR = _Fitting(0.0, 7), _Fitting(0.5, 3)
+_FROM_AFAR, _FROM_NEAR = _Fitting(0.0, 7), _Fitting(0.35, 3)
 
 
 class EvenStretch(Isotropic):
