@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify, find_cuts
+from quasiharmonic.apps.unwrapping import chart_search
+from quasiharmonic.apps.unwrapping.chart_cuts import divide
 from quasiharmonic.apps.unwrapping.chart_maps import EvenStretch, WorkingChart
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.triangle_moves import join_small_charts
@@ -128,6 +130,18 @@ def test_a_limit_on_charts_is_kept_and_what_it_costs_is_reported():
         below = np.cumsum(areas(V, F)[chart.triangles][order])
         quantile = chart.stretch[order[np.searchsorted(below, 0.99 * below[-1])]]
         assert chart.misses == pytest.approx(max(quantile - 1.02, worst - 3, 0), rel=1e-6)
+
+
+def test_a_division_into_three_parts_does_not_exceed_a_limit_on_charts(monkeypatch):
+    def divide_twice(chart, bound):
+        first, *others = divide(chart, bound)
+        first.uv = None
+        return [*divide(first, bound), *others]
+
+    V, F = sphere(6)
+    monkeypatch.setattr(chart_search, "divide", divide_twice)
+    assert len(find_charts(V, F, max_stretch=1.02)) > 2
+    assert len(find_charts(V, F, max_stretch=1.02, max_charts=2)) <= 2
 
 
 @pytest.mark.long

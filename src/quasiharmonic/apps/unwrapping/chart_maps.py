@@ -1,10 +1,8 @@
 """Flatten one chart with a free boundary, and measure its stretch.
 
-First, the map is fitted to triangles with little stretch (`Fits`): one factorisation for all fits. Where that is not
-enough, Newton's method lowers the symmetric Dirichlet energy. This is a mean, so it accepts much stretch in few
-triangles. If more of the chart than allowed is stretched beyond the bound, the descent continues with `EvenStretch`,
-which weights large stretch more. The boundary is not guarded against overlaps. A chart that overlaps itself is divided
-by the caller, which also lowers its stretch.
+The symmetric Dirichlet energy is a mean, so it accepts much stretch in few triangles. If more of the chart than allowed
+is stretched beyond the bound, the descent continues with `EvenStretch`, which weights large stretch more. The boundary
+is not guarded against overlaps. A chart that overlaps itself is divided by the caller, which also lowers its stretch.
 """
 
 from __future__ import annotations
@@ -22,16 +20,13 @@ from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import descend_on_patches
-from quasiharmonic.apps.unwrapping.fits import FIT_TUNING, Fits, limit_stretch
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Deformation, Energy, Isotropic, SymmetricDirichlet
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
-from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
-from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_complex, to_points
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.options import FlattenOptions
 
 #: No triangle may be stretched more than this, except triangles with a smaller angle than `THIN_ANGLE`.
@@ -59,32 +54,11 @@ class ChartTuning(NamedTuple):
     least_energy: float = 0.1
     # From mean energies below this, Newton steps are used directly.
     near: float = 1.0
-    # Fits end when one lowers the share over the bound by less than this factor.
-    slow_fit: float = 0.9
-    # A larger multiple of the free share over the bound is not lowered by a further descent.
-    hopeless: float = 2.0
-    # Descents follow on fits with more stretch than this, also if the bound permits it.
-    little: float = 1.3
-    # Least number of fits.
-    least_fits: int = 3
     # Boundary vertices are rounded to this multiple of the root of the area before contacts are sought.
     gap: float = 2.0**-20
 
 
 _TUNING = ChartTuning()
-
-
-class _Fitting(NamedTuple):
-    """How a map is fitted."""
-
-    # Fits permit this share of the stretch that the bound permits. With 0, they are to rotations.
-    permitted: float
-    # Number of fits after which slow ones end.
-    patience: int
-
-
-# From a map that is far from the final one, and from one that is near.
-_FROM_AFAR, _FROM_NEAR = _Fitting(0.0, 7), _Fitting(0.35, 3)
 
 
 class EvenStretch(Isotropic):
@@ -213,7 +187,6 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
     ``check_wanted`` is called before every step and may raise an exception. If no injective map is found in double
     precision, the chart has no map.
     """
-    improved = True
     if chart.uv is None:
         flat = chart.piece.planar_map()
         uv = flat if flat is not None else chart.start if chart.start is not None else _initial_map(chart.piece)
@@ -221,33 +194,18 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
             chart.stretch = np.full(len(chart.F), np.inf)
             return
         chart.use(uv)
-        good = flat is not None
         if chart.start is not None:
             _relax_long(chart, bound)
-            good = good or not chart.too_long.any()
-        elif not good:
-            good = _fit(chart, bound, _FROM_AFAR, check_wanted) and _finish_fit(chart, bound, check_wanted)
-        if not good:
+        if flat is None and (chart.start is None or chart.too_long.any()):
             _descend(chart, SymmetricDirichlet(), check_wanted)
             _relax_long(chart, bound)
         if keeps_bound(chart, bound):
             return
     else:
         chart.use(chart.uv)
-        if keeps_bound(chart, bound):
-            if chart.bijective:
-                return
-            # Fits would leave the map of a chart that only overlaps itself.
-            improved = False
-        else:
-            improved = _fit(chart, bound, _FROM_NEAR, check_wanted)
-            _relax_long(chart, bound)
-            if improved and _finish_fit(chart, bound, check_wanted):
-                return
-    # Where much of the chart exceeds the bound, only cuts help.
-    hopeless = improved and chart.share_over(bound) > _TUNING.hopeless * FREE_SHARE
-    if not hopeless or chart.too_long.any():
-        _descend(chart, EvenStretch(bound), check_wanted)
+        if chart.bijective and keeps_bound(chart, bound):
+            return
+    _descend(chart, EvenStretch(bound), check_wanted)
 
 
 def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None:
@@ -264,21 +222,6 @@ def keeps_bound(chart: WorkingChart, bound: float) -> bool:
     return chart.share_over(bound) <= FREE_SHARE and not chart.too_long.any()
 
 
-def _finish_fit(chart: WorkingChart, bound: float, check_wanted: Callable[[], object]) -> bool:
-    """Lower the stretch after fits by one step; return False if the map needs a descent.
-
-    It needs none if it is bijective, with little stretch even if more is permitted.
-    """
-    fitted, little = chart.uv, min(bound, _TUNING.little)
-    if not (chart.bijective and keeps_bound(chart, little)):
-        return False
-    _descend(chart, SymmetricDirichlet(), check_wanted, 1)
-    if not (chart.bijective and keeps_bound(chart, little)):
-        assert fitted is not None
-        chart.use(fitted)
-    return True
-
-
 def _initial_map(piece: Piece) -> FloatArray | None:
     """An injective map (n, 2), or None if none was found in double precision."""
     starts = [map_to_disk, flatten_coarse]
@@ -290,9 +233,7 @@ def _initial_map(piece: Piece) -> FloatArray | None:
 
 
 @np.errstate(all="ignore")
-def _descend(
-    chart: WorkingChart, density: Energy, check_wanted: Callable[[], object], steps: int = _TUNING.max_steps
-) -> None:
+def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> None:
     """Lower an energy of the chart's map, which stays injective."""
     assert chart.uv is not None
     value = chart.piece.energy(density, None).value(in_units(chart.uv, 0))
@@ -301,7 +242,7 @@ def _descend(
     descent = SurfaceDescent(energy, chart.uv, "auto")
     before = np.inf
     try:
-        for _ in itertools.islice(descend(descent, density, _TUNING.tolerance), steps):
+        for _ in itertools.islice(descend(descent, density, _TUNING.tolerance), _TUNING.max_steps):
             check_wanted()
             if descent.distortion < _TUNING.nothing or descent.distortion > (1 - _TUNING.slow) * before:
                 break
@@ -309,37 +250,6 @@ def _descend(
     finally:
         # After a time limit, the chart has the map so far.
         chart.use(descent.uv)
-
-
-@np.errstate(all="ignore")
-def _fit(chart: WorkingChart, bound: float, tuning: _Fitting, check_wanted: Callable[[], object]) -> bool:
-    """Use the map after fits, and return True; False if it is not injective.
-
-    They end when the map keeps the bound, or hardly changes.
-    """
-    assert chart.uv is not None
-    w, before, permitted = to_complex(chart.uv), np.inf, 1 + tuning.permitted * (bound - 1)
-    try:
-        fits = Fits(chart.F, chart.piece.energy(SymmetricDirichlet(), None).g)
-        for k in range(FIT_TUNING.most_fits):
-            check_wanted()
-            p, q = fits.derivatives(w)
-            over = fits.share_over(p, q, bound)
-            if k >= _TUNING.least_fits and over <= FIT_TUNING.enough * FREE_SHARE:
-                break
-            slow = over > _TUNING.slow_fit * before and over > _TUNING.hopeless * FREE_SHARE
-            if k >= tuning.patience and slow:
-                break
-            before = over
-            target_p, target_q = limit_stretch(p, q, permitted)
-            w = w + fits.place(target_p - p, target_q - q)
-    except NotPositiveDefinite:
-        return False
-    uv = to_points(w)
-    if not np.isfinite(uv).all() or not is_injective(chart.F, uv):
-        return False
-    chart.use(uv)
-    return True
 
 
 def _relax_long(chart: WorkingChart, bound: float) -> None:

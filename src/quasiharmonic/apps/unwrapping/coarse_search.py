@@ -3,12 +3,17 @@
 The seams of all charts of the coarse mesh are carried to the surface and shortened there. A vertex in the interior of a
 coarse chart keeps its position in that chart's map, and so do vertices that are inserted between such vertices. They
 give the rotations of their triangles. The triangles near seams get theirs by unfolding from their neighbours. The map
-is fitted to the rotated triangles, then to the nearest ones that are stretched little, which is repeated (`Fits`).
-Triangles that collapse or invert meanwhile are rotated anew, as their neighbours unfold. The surroundings of the few
-triangles that stay inverted are mapped by `injective_map`. A map whose boundary meets itself at more than a few places
-is not used.
+is fitted to the rotated triangles [1]_, then to the nearest ones that are stretched little, which is repeated. All
+systems have one unknown per vertex and the same matrix. Triangles that collapse or invert meanwhile are rotated anew,
+as their neighbours unfold. The surroundings of the few triangles that stay inverted are mapped by `injective_map`. A
+map whose boundary meets itself at more than a few places is not used.
 
 The coarse mesh of a huge surface is large, and searched in the same way on a coarser one.
+
+References
+----------
+.. [1] L. Liu, L. Zhang, Y. Xu, C. Gotsman, S. J. Gortler, A local/global approach to mesh parameterization. Computer
+   Graphics Forum 27 (2008).
 """
 
 from __future__ import annotations
@@ -20,7 +25,6 @@ import numpy as np
 from quasiharmonic.apps.flattening.worst_triangles import mark_around
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, NO_CUT, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
-from quasiharmonic.apps.unwrapping.fits import FIT_TUNING, Fits, direction, limit_stretch, singular_values
 from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.geometry.coarsening import Removal, has_marked_corner, mark_rings
 from quasiharmonic.geometry.exact.certificate import is_injective
@@ -30,20 +34,25 @@ from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.splitting import split_parts
 from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.targets.cuts.find import find_cuts_by
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at, to_complex, to_points
 
 
-class StartTuning(NamedTuple):
-    """Numbers that tune how initial maps are fitted and repaired."""
+class FitTuning(NamedTuple):
+    """Numbers that tune the fits of maps to rotated triangles, and their repair."""
 
-    # Number of fits to rotations. Later fits permit some stretch.
+    # Number of further fits to rotated triangles, after the first one. Later fits permit some stretch.
     rotated_fits: int = 4
+    # Least number of further fits, after which they stop when the aim is reached.
+    least_fits: int = 6
+    # The aim counts as reached if at most this part of the free share exceeds it: repairs may stretch a little more.
+    enough: float = 0.5
+    # Largest number of further fits.
+    most_fits: int = 16
     # A later fit permits this share of the stretch that the aim permits.
     permitted: float = 0.5
-    # Least number of fits after the first one, after which they stop when the aim is reached.
-    least_fits: int = 6
     # A triangle whose singular values have a smaller ratio gets a new rotation.
     least_ratio: float = 0.15
     # Maps with a larger share of inverted triangles are not repaired.
@@ -56,7 +65,7 @@ class StartTuning(NamedTuple):
     largest_share: float = 0.5
 
 
-_TUNING = StartTuning()
+_TUNING = FitTuning()
 
 
 class CoarseSearch:
@@ -157,38 +166,62 @@ def _fit(
 ) -> FloatArray | None:
     """Return an injective map (n, 2) close to the positions w (n,) of some vertices; None if none was found.
 
-    ``g`` (3, f) is as in `NewtonSystem`, and ``aim`` the stretch at which the fits end.
+    ``g`` (3, f) is as in `NewtonSystem`, and ``aim`` the stretch at which the fits end. With the derivatives p and q of
+    the map in each triangle, and targets P and Q, each fit minimises ``Σ area (|p − P|² + |q − Q|²)``: ARAP's global
+    step, with one factorisation of the Laplacian for all fits (Liu et al. 2008). First, Q is 0 and P a rotation.
     """
-    F, fits, unfolding = chart.F, Fits(chart.F, g), _Unfolding(chart.F, g)
-    p, q = fits.derivatives(w)
-    turned = unfolding.carry(direction(p), known[F].all(axis=1) & (np.abs(p) > np.abs(q)))
+    F, n = chart.F, len(w)
+    corners = np.ascontiguousarray(F.T)
+    unfolding = _Unfolding(F, g)
+    p, q = _derivatives(g, w[corners])
+    turned = unfolding.carry(_direction(p), known[F].all(axis=1) & (np.abs(p) > np.abs(q)))
     if turned is None:
         return None
-    w = fits.place(turned, np.zeros_like(turned))
+    # Up to a factor, which all terms have.
+    area = 1 / np.abs((g[1].conj() * g[2]).imag)
+    fitted = Laplacian(F, n, np.array([0])).factor(2 * area * (g * g[(1, 2, 0), :].conj()).real)
+    w = fitted.respond(sum_at(corners.ravel(), (area * turned * g).ravel(), n))
     most = 1 + _TUNING.permitted * (aim - 1)
-    for k in range(FIT_TUNING.most_fits + 1):
+    for k in range(_TUNING.most_fits + 1):
         workers.check_wanted()
-        p, q = fits.derivatives(w)
-        enough = fits.share_over(p, q, aim) <= FIT_TUNING.enough * FREE_SHARE
-        if k == FIT_TUNING.most_fits or (k >= _TUNING.least_fits and enough):
+        p, q = _derivatives(g, w[corners])
+        larger, smaller = np.abs(p) + np.abs(q), np.abs(p) - np.abs(q)
+        with np.errstate(all="ignore"):
+            scale = np.sqrt(area.sum() / (area * larger * smaller).sum())
+        good = (larger * scale < aim) & (smaller * scale * aim > 1)
+        enough = area[~good].sum() <= _TUNING.enough * FREE_SHARE * area.sum()
+        if k == _TUNING.most_fits or (k >= _TUNING.least_fits and enough):
             break
         # At first the targets are rotations, then the nearest matrices with little stretch.
-        target_p, target_q = limit_stretch(p, q, 1.0 if k < _TUNING.rotated_fits else most)
-        larger, smaller = singular_values(p, q)
-        collapsed = smaller <= _TUNING.least_ratio * larger
+        less = 1.0 if k < _TUNING.rotated_fits else most
+        rotation, collapsed = _direction(p), smaller <= _TUNING.least_ratio * larger
+        larger, smaller = np.clip(larger, 1 / less, less), np.clip(smaller, 1 / less, less)
         if collapsed.any():
             # The boundary would stay folded where the rotations of these triangles are wrong.
-            near = has_marked_corner(F, mark_around(F, collapsed, len(w)))
-            carried = unfolding.carry(direction(p), ~near)
+            near = has_marked_corner(F, mark_around(F, collapsed, n))
+            carried = unfolding.carry(rotation, ~near)
             if carried is not None:
-                target_p[near], target_q[near] = carried[near], 0
-        w = w + fits.place(target_p - p, target_q - q)
+                rotation = carried
+                larger[near] = smaller[near] = 1.0
+        target = 0.5 * (larger + smaller) * rotation - p, 0.5 * (larger - smaller) * _direction(q) - q
+        load = area * (target[0] * g + target[1] * g.conj())
+        w = w + fitted.respond(sum_at(corners.ravel(), load.ravel(), n))
     if not np.isfinite(w).all():
         return None
     rim = sum(map(len, chart.piece.loops))
     if len(check_loops(chart.piece.loops, to_points(w))[0]) > _TUNING.few_crossings * rim:
         return None
     return _repair(chart, to_points(w))
+
+
+def _derivatives(g: ComplexArray, at: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Complex derivatives p and q (f,) of a map with positions ``at`` (3, f) of the corners."""
+    return (g.conj() * at).sum(axis=0), (g * at).sum(axis=0)
+
+
+def _direction(p: ComplexArray) -> ComplexArray:
+    """Return ``p / |p|``, or 0."""
+    return p / np.maximum(np.abs(p), np.finfo(np.float64).tiny)
 
 
 def _repair(chart: WorkingChart, uv: FloatArray) -> FloatArray | None:
@@ -249,7 +282,7 @@ class _Unfolding:
                 return turned
             new = there[reached]
             total = sum_at(new, turned[source[reached]] * turn[reached], len(done))
-            turned[new] = direction(total[new])
+            turned[new] = _direction(total[new])
             done[new] = True
             left = ~done[there]
             source, there, turn = source[left], there[left], turn[left]
