@@ -1,6 +1,7 @@
 """Methods in the joint space of map and tensor, for the last inverted triangles: Newton's, and the greedy alternation.
 
-Newton's method (§F.2) has a trust region and no line search. Newton's method on positions, for distortion energies, is `energies.newton`.
+Newton's method (§F.2) has a trust region and no line search. Newton's method on positions, for distortion energies, is
+`energies.newton`.
 
 The energy ``P(u, v, ξ) = Σ m [c (|p|² + |q|²) − 2 Re(t p q̄)]`` with ``c(|ξ|)`` and ``t = s(|ξ|) ξ/|ξ|`` couples ξ and
 the map triangle by triangle. In the directions along and across ξ, ``δξ = (α + iβ) ξ/|ξ|``:
