@@ -28,8 +28,7 @@ from quasiharmonic.apps.flattening.connected_parts import (
 )
 from quasiharmonic.apps.flattening.distance_descent import DistanceKeywords, lower_distance_error
 from quasiharmonic.apps.flattening.flattening_run import Flattening
-from quasiharmonic.apps.flattening.initial_maps import COARSE_FROM
-from quasiharmonic.apps.flattening.piece import Piece, check_in_range, to_given_unit
+from quasiharmonic.apps.flattening.piece import COARSE_FROM, Piece, check_in_range, to_given_unit
 from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.polishing import find_energy
