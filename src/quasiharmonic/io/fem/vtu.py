@@ -26,9 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.atomic import write_whole
-from quasiharmonic.io.fem.mesh_parts import MeshParts
+from quasiharmonic.io.fem.mesh_parts import MeshParts, find_sets_in_fields, select_elements
 from quasiharmonic.io.fem.number_tables import TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import find_sets_in_fields, select_elements
 from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
