@@ -36,8 +36,8 @@ from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.search.harmonising import harmonise_map
 from quasiharmonic.targets import outline
+from quasiharmonic.targets.boundary.boundary_to import fit_boundary
 from quasiharmonic.targets.boundary.corner_pins import CornerSpec
-from quasiharmonic.targets.boundary.fitted_problems import fit_boundary
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

@@ -36,7 +36,7 @@ from quasiharmonic.io.untrusted import use_bound
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refinement import on_refinement
-from quasiharmonic.targets.boundary.fitted_problems import FittedProblem
+from quasiharmonic.targets.boundary.boundary_to import FittedProblem
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
