@@ -14,9 +14,9 @@ import pytest
 from quasiharmonic import Status, certify, distortion, flatten, keep_distances, surfaces
 from quasiharmonic.apps.flattening import free_boundary
 from quasiharmonic.apps.flattening import piece as pieces
-from quasiharmonic.apps.flattening.coarse_distances import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.distance_descent import DistanceEnergy, DistancePairs, lower_distance_error
+from quasiharmonic.apps.flattening.large_surfaces import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
 from quasiharmonic.energies.distances import surface_distances

@@ -10,8 +10,8 @@ import pytest
 from quasiharmonic import Status, certify, distortion, find_cuts, flatten, is_injective
 from quasiharmonic.apps.flattening import distance_descent, free_boundary
 from quasiharmonic.apps.flattening import piece as pieces
-from quasiharmonic.apps.flattening.coarse_distances import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.large_surfaces import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.multilevel import Hierarchy, Level, descend_level, flatten_coarse, map_to_disk
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.worst_triangles import smooth_map, thick_energy

@@ -21,7 +21,7 @@ from quasiharmonic.apps.atlas.mapped_atlas import (
     orient_islands,
 )
 from quasiharmonic.apps.flattening import free_boundary
-from quasiharmonic.apps.flattening.connected_parts import fit_unit_square, place_in_row
+from quasiharmonic.apps.flattening.piece import fit_unit_square, place_in_row
 from quasiharmonic.energies.deformation import positive_weights, signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.polishing import polish_map
