@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from types import SimpleNamespace
 
 import numpy as np
@@ -60,6 +62,18 @@ def test_no_drift_after_a_closed_motion(ring):
     for x in (*np.linspace(0, 0.2, 8), *np.linspace(0.2, 0, 8)):
         mesh.advance(points[hole] + (x, x / 2))
     assert np.abs(mesh.points - points).max() < 1e-3
+
+
+@pytest.mark.parametrize("slide", [False, True])
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda mesh: pickle.loads(pickle.dumps(mesh))])
+def test_a_copy_continues_like_its_mesh(ring, again, slide):
+    points, F, _, hole = ring
+    mesh = MovingMesh(points, F, hole, slide=slide)
+    # The mesh has a factor after its first step only.
+    for degrees in (5, 10):
+        other = again(mesh)
+        there = mesh.advance(turned(points[hole], degrees))
+        np.testing.assert_array_equal(other.advance(turned(points[hole], degrees)), there)
 
 
 def test_a_step_is_newtons_for_the_new_boundary():

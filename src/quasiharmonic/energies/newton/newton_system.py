@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,15 @@ class NewtonSystem:
         """The solver, which is made when it is used first."""
         return make_solver(self._indptr, self._indices, name=self._linear_solver)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Factors belong to a process.
+        return {name: value for name, value in vars(self).items() if name != "solver"}
+
+    @property
+    def _values(self) -> FloatArray:
+        """The values of the assembled matrix, a view."""
+        return self._sums[:-2]
+
     def take_gradients(self, g: ComplexArray) -> None:
         """Set new gradients (3, f) of the hat functions on the same triangles, for example for another scale."""
         self._g = np.ascontiguousarray(g, dtype=np.complex128)
@@ -91,7 +100,6 @@ class NewtonSystem:
         # By triangle: the first entries of both rows of the blocks of its sides, from lower to higher free vertex, and
         # of its corners. Blocks of fixed vertices go to unused entries behind the matrix.
         self._sums = np.empty(upper[-1] + 2)
-        self._values = self._sums[:-2]
         corner = place[F.T]
         self._turns = np.where(corner <= corner[(1, 2, 0), :], 1.0, -1.0)
         self._slots = np.full((2, 2, *corner.shape), upper[-1], dtype=np.int32)
