@@ -72,7 +72,7 @@ def block(kind, rows):
 STAND_INS = {
     "trimesh": SimpleNamespace(vertices=V, faces=F, triangles=V[F]),
     "open3d": SimpleNamespace(vertices=V.tolist(), triangles=F.astype(np.int32)),
-    "pyvista": SimpleNamespace(points=V, faces=padded(F), verts=np.empty(0, int)),
+    "pyvista": SimpleNamespace(points=V, faces=padded(F), verts=np.empty(0, int), strips=np.empty(0, int)),
     "grid of pyvista": SimpleNamespace(
         points=V, cells=padded([[0], *F, [0, 1]]), celltypes=np.array([1, *[5] * len(F), 3])
     ),
@@ -289,6 +289,10 @@ def test_arrays_of_other_libraries(wrap):
         (lambda: flatten(SimpleNamespace(points=V, cells=[block("tetra", F)])), "cells of type 'tetra'"),
         (lambda: flatten(SimpleNamespace(points=V, simplices=F[:, [0, 1, 2, 0]])), "simplices .* are tetrahedra"),
         (lambda: flatten(SimpleNamespace(points=V, cells=padded(F), celltypes=[10] * len(F))), "VTK type 10"),
+        (
+            lambda: flatten(SimpleNamespace(points=V, faces=padded(F[1:]), strips=padded(F[:1]))),
+            r"a SimpleNamespace has triangle strips: pass mesh\.triangulate\(\)",
+        ),
         (lambda: flatten(SimpleNamespace(points=V, faces=padded(F + 99))), "the faces refers? to vert"),
         (lambda: flatten(V, F + 1), rf"vertex {len(V)}, but .*; if its indices count from 1, pass F - 1"),
         (

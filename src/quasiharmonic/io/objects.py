@@ -168,7 +168,7 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     Raises
     ------
     ValueError
-        If positions or faces are missing, or there are cells that are not faces, such as tetrahedra.
+        If positions or faces are missing, or there are triangle strips or cells that are not faces, such as tetrahedra.
     quasiharmonic.io.MeshFileError
         If the file cannot be read.
     """
@@ -200,6 +200,9 @@ def mesh_arrays(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     name = f"{faces} of {what}"
     if faces == "simplices" and np.shape(_part(mesh, faces))[1:] == (4,):
         raise ValueError(f"{name} are tetrahedra: only surface cells are supported")
+    strips = _part(mesh, "strips")
+    if isinstance(strips, np.ndarray) and strips.size:
+        raise ValueError(f"{what} has triangle strips: pass mesh.triangulate()")
     V = vertex_array(_part(mesh, positions), f"{positions} of {what}")
     return V, _triangles(V, name, _part(mesh, faces), _part(mesh, "celltypes"))
 
