@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import pickle
 from enum import Enum
@@ -132,6 +133,17 @@ def test_results_can_be_pickled(made):
     again = pickle.loads(pickle.dumps(made))
     assert again.to_dict() == made.to_dict()
     assert again.summary() == made.summary()
+
+
+def test_results_are_compared_by_identity(made):
+    assert made in {made}
+    assert made != copy.copy(made)
+
+
+def test_recorded_maps_are_compared_by_identity():
+    first, second = (qh.flatten(*disk(4), record_every=1).path for _ in range(2))
+    assert first[0] in first
+    assert len({*first, *second}) == len(first) + len(second)
 
 
 def test_the_drift_of_a_pickled_morph_is_the_same():

@@ -228,7 +228,7 @@ class Step:
     energy: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Snapshot:
     """The map at one iteration; ``history[iteration]`` has its inverted triangles and energy.
 
@@ -295,7 +295,7 @@ class RefinementAttempt:
         return dict(vars(self))
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MapResult(ReadOnly, Displayable, Outcome):
     """A map of the mesh into the plane, with its certificate.
 
