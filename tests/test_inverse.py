@@ -314,6 +314,9 @@ def test_invalid_input_is_named():
         inverse.sample_grid(1, 5)
     with pytest.raises(ValueError, match=r"rows must be an integer of at least 2, not 3\.5"):
         inverse.sample_grid(3, 3.5)
+    for box in ((0, 0, 1), (0, 0, np.nan, 1), (0, 0, 1, np.inf), (1, 0, 0, 1), (0, 1, 1, 0)):
+        with pytest.raises(ValueError, match="box must be finite: minimum u and v, then maximum u and v, not"):
+            inverse.sample_grid(3, 3, box=box)
 
 
 def test_transfer_between_meshes_of_one_square(rng):

@@ -349,14 +349,17 @@ class InverseMap(ReadOnly):
         Raises
         ------
         ValueError
-            If ``columns`` or ``rows`` is not an integer of at least 2.
+            If ``columns`` or ``rows`` is not an integer of at least 2, or ``box`` is invalid.
         """
         check_integer("columns", columns, minimum=2)
         check_integer("rows", rows, minimum=2)
         if box is None:
             corners = self.uv[self.F]
             box = (*corners.min(axis=(0, 1)).tolist(), *corners.max(axis=(0, 1)).tolist())
-        u, v = np.linspace(box[0], box[2], columns), np.linspace(box[1], box[3], rows)
+        ends = real_array("box", box)
+        if ends.shape != (4,) or not np.isfinite(ends).all() or (ends[:2] > ends[2:]).any():
+            raise ValueError(f"box must be finite: minimum u and v, then maximum u and v, not {box}")
+        u, v = np.linspace(ends[0], ends[2], columns), np.linspace(ends[1], ends[3], rows)
         return u, v, self.locate(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1))
 
     @cached_property
