@@ -296,7 +296,7 @@ def test_a_wrong_number_is_named_with_what_the_option_takes(call, message, capsy
 def test_polish_has_a_time_limit(star, tmp_path, capsys):
     assert run("map", star, "-o", tmp_path / "map.obj") == 0
     assert run("polish", tmp_path / "map.obj", "-o", tmp_path / "out.obj", "--time-limit", "1e-9") == 2
-    assert "no map after the time limit of 1e-09 s" in capsys.readouterr().err
+    assert "no map was computed within the time limit of 1e-09 s" in capsys.readouterr().err
     assert run("polish", tmp_path / "map.obj", "-o", tmp_path / "out.obj", "--time-limit", "60", "--free") == 0
 
 

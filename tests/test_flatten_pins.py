@@ -243,7 +243,7 @@ def test_malformed_input_is_rejected():
     V, F = disk(3)
     for fixed, target, message in (
         ([], np.zeros((0, 2)), "fixed has no vertex"),
-        ([1, 1], np.zeros((2, 2)), "vertex 1 fixed more than once"),
+        ([1, 1], np.zeros((2, 2)), "fixed contains vertex 1 more than once"),
         ([1, 99], np.zeros((2, 2)), "refers to vertex 99"),
         ([1], [[np.nan, 0.0]], "not finite at row 0"),
         ([1], [[0.0, 0.0, 0.0]], r"shape \(1, 2\)"),

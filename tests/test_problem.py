@@ -66,7 +66,7 @@ TWO_TRIANGLES = np.array([[0, 1, 2], [3, 4, 5]])
         ),
         ({"fixed": RIM[1:], "target": TARGET[1:]}, f"boundary vertex {RIM[0]} not in fixed"),
         ({"fixed": [], "target": np.zeros((0, 2))}, rf"\({len(RIM)} in all\) not in fixed"),
-        ({"fixed": np.append(RIM, RIM[2]), "target": np.vstack([TARGET, TARGET[2]])}, f"{RIM[2]} fixed more than"),
+        ({"fixed": np.append(RIM, RIM[2]), "target": np.vstack([TARGET, TARGET[2]])}, f"{RIM[2]} more than once"),
         ({"fixed": changed(RIM, 0, 999)}, "fixed refers to vertex 999"),
         ({"fixed": changed(RIM, 0, -3)}, "fixed refers to vertex -3"),
         ({"fixed": RIM.astype(float)}, "fixed must contain integer"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -285,7 +286,7 @@ class TestStrategy:
         with pytest.raises(ValueError, match="strategy must be one of speed, paper"):
             stages_of("haste", problem)
         for wrong in ([], 3, ["speed"]):
-            with pytest.raises(ValueError, match="or a list of Descent"):
+            with pytest.raises(ValueError, match=re.escape(f"or a non-empty list of Descent, not {wrong}")):
                 stages_of(wrong, problem)
 
     def test_problems_with_pins_start_with_si_log(self):

@@ -306,7 +306,7 @@ def test_needles_and_malformed_meshes():
             morph(points, cells, cavity, X[cavity])
     with pytest.raises(ValueError, match="not finite"):
         morph(X, T, cavity, np.full((len(cavity), 3), np.inf))
-    with pytest.raises(ValueError, match="vertex 0 moved more than once"):
+    with pytest.raises(ValueError, match="moved_vertices contains vertex 0 more than once"):
         morph(X, T, [0, 0], X[[0, 0]])
     for options, message in (({"energy": "foo"}, "foo"), ({"linear_solver": "foo"}, "linear_solver must be one of")):
         for function in (morph, lambda X, T, moved, _, **options: MovingMesh(X, T, moved, **options)):

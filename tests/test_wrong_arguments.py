@@ -7,12 +7,16 @@ import pytest
 
 from quasiharmonic import (
     InverseMap,
+    MovingMesh,
     SurfaceMap,
     atlas,
     batch,
+    boundary_loops,
     flatten,
+    injective_map,
     injective_maps,
     io,
+    morph,
     plot,
     surfaces,
     targets,
@@ -21,6 +25,7 @@ from quasiharmonic import (
 from quasiharmonic.surfaces import disk
 
 V, F = disk(2)
+(LOOP,) = boundary_loops(F)
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 IMAGE = np.zeros((4, 4))
 
@@ -101,6 +106,11 @@ def test_a_value_that_is_no_file_name(call, name, value):
         (lambda: batch.Settings(corner_angle=30), "corner_angle applies only to plain meshes with an outline"),
         (lambda: batch.run("a", "b", {}), "settings must be a Settings, not a dict"),
         (lambda: injective_maps(None), "problems must be a sequence of problems, not None"),
+        (lambda: boundary_loops([[0, 1, 2], [1, 0, 3], [0, 1, 4]]), r"edge \(0, 1\) in more than two triangles"),
+        (lambda: morph(V, F, [1, 1], V[[1, 1]]), "moved_vertices contains vertex 1 more than once"),
+        (lambda: MovingMesh(V, F, [1, 1]), "moved_vertices contains vertex 1 more than once"),
+        (lambda: injective_map(V, F, LOOP, V[LOOP], polish="foo"), "polish must be one of .*, not 'foo'"),
+        (lambda: injective_map(V, F, LOOP, V[LOOP], slide=True), "give an energy as well, by polish"),
         (lambda: flatten(V, F, linear_solver=[]), "linear_solver must be one of auto, .*, not a list"),
     ],
 )

@@ -218,24 +218,24 @@ def polish_result(
 def polish_options(options: MapOptions) -> PolishOptions:
     """Return the options of the polish that follows a search, with the energy that they name."""
     return PolishOptions(
-        energy=find_energy(options.polish),
+        energy=find_energy(options.polish, "polish"),
         linear_solver=options.linear_solver,
         callback=options.callback,
         slide=options.slide,
     )
 
 
-def find_energy(energy: str | Energy) -> Energy:
-    """Look up an energy by its name and reject energies that `polish` cannot minimise."""
+def find_energy(energy: str | Energy, option: str = "energy") -> Energy:
+    """Look up the energy of an option by its name and reject energies that `polish` cannot minimise."""
     if isinstance(energy, str):
         if energy not in ENERGIES:
             raise ValueError(
-                f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}: use harmonise "
+                f"{option} must be one of {', '.join(ENERGIES)}, or an Energy, not {energy!r}: use harmonise "
                 f"for energies without a barrier, which let triangles collapse{suggest(energy, ENERGIES)}"
             )
         return ENERGIES[energy]
     if not isinstance(energy, Energy):
-        raise ValueError(f"energy must be one of {', '.join(ENERGIES)}, or an Energy, not {describe(energy)}")
+        raise ValueError(f"{option} must be one of {', '.join(ENERGIES)}, or an Energy, not {describe(energy)}")
     if not energy.barrier:
         raise ValueError(
             f"{type(energy).__name__} is not a barrier energy, so triangles would collapse; "

@@ -19,7 +19,7 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     ReadOnly,
-    fixed_vertices,
+    distinct_vertices,
     make_unchangeable,
     mark,
     reject,
@@ -67,7 +67,9 @@ class Domain(ReadOnly):
         self.V: FloatArray = vertex_array(V)
         self.F: IntArray = make_unchangeable(triangle_array(F, self.n))
         self.edges: Edges = surface_edges(self.F, self.n)
-        self.fixed: IntArray = fixed_vertices(np.unique(self.edges.boundary) if fixed is None else fixed, self.n)
+        self.fixed: IntArray = distinct_vertices(
+            "fixed", np.unique(self.edges.boundary) if fixed is None else fixed, self.n
+        )
         self.loops: list[IntArray] = trace_loops(self.edges.boundary)
         self._seal()
         self._empty_caches()

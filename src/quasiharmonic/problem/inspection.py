@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.exact.loops import join_items
 from quasiharmonic.geometry.mesh.reference import flat_triangles
 from quasiharmonic.geometry.mesh.splitting import fans, find_representatives
-from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, boundary_edges, edges, find_twins, trace_loops
+from quasiharmonic.geometry.mesh.topology import Edges, are_collapsed, edges, find_twins, manifold_edges, trace_loops
 from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.io.objects import MeshLike, mesh_triangles
 from quasiharmonic.util.arrays import (
@@ -165,7 +165,7 @@ def boundary_loops(F: ArrayLike | MeshLike, n: int | None = None) -> list[IntArr
     ------
     ValueError
         If the array has the wrong shape, an index is out of range, or the boundary does not form loops, because
-        surfaces touch at a vertex or orientations differ; names the vertices.
+        surfaces touch at a vertex, an edge is in three triangles or orientations differ; names the elements.
 
     See Also
     --------
@@ -185,7 +185,12 @@ def boundary_loops(F: ArrayLike | MeshLike, n: int | None = None) -> list[IntArr
         n = int(triangles.max(initial=-1)) + 1
     check_integer("n", n, minimum=0)
     check_range("F", triangles, n)
-    return trace_loops(boundary_edges(triangles, n))
+    try:
+        return trace_loops(edges(triangles, n).boundary)
+    except ValueError:
+        # Edges that are not of a surface explain it better.
+        manifold_edges(triangles, n)
+        raise
 
 
 @accepts_mesh

@@ -183,7 +183,7 @@ def run_within(seconds: float | None, compute: Callable[[], MapResult]) -> MapRe
             result = compute()
     if result is None:
         if limit.reached:
-            raise TimeoutError(f"there is no map after the time limit of {seconds:g} s: allow more time")
+            raise TimeoutError(f"no map was computed within the time limit of {seconds:g} s: allow more time")
         raise KeyboardInterrupt
     interrupted = limit.reached and result.status is Status.INTERRUPTED
     return replace(result, status=Status.TIME_LIMIT) if interrupted else result

@@ -202,7 +202,7 @@ def solve_problem(problem: Problem, options: MapOptions) -> MapResult:
     polishing = None if options.polish is None else polish_options(options)
     if options.slide is not False:
         if polishing is None:
-            raise ValueError("the boundary slides only while distortion is lowered: give an energy as well")
+            raise ValueError("the boundary slides only while distortion is lowered: give an energy as well, by polish")
         problem = move_onto(options.slide, problem)
     if options.refine:
         # Import on demand: refinement also imports the construction and the diagnosis, which most maps do not need.

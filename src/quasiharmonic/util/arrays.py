@@ -309,10 +309,10 @@ def vertex_indices(name: str, vertices: ArrayLike, n: int) -> IntArray:
     return array
 
 
-def fixed_vertices(fixed: ArrayLike, n: int) -> IntArray:
-    """Convert indices of fixed vertices among ``n`` vertices to (k,) int64 without repetition; returns a copy."""
-    array = vertex_indices("fixed", fixed, n)
-    message = "{} fixed more than once: list each vertex once"
+def distinct_vertices(name: str, vertices: ArrayLike, n: int) -> IntArray:
+    """Convert indices of some of ``n`` vertices to (k,) int64 without repetition; returns a copy."""
+    array = vertex_indices(name, vertices, n)
+    message = f"{name} contains {{}} more than once: list each vertex once"
     reject(np.bincount(array, minlength=n) > 1, "vertex", "vertices", message)
     return array
 

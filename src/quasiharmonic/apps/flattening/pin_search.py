@@ -41,8 +41,8 @@ from quasiharmonic.solver.search.stages import CoarseToFine, Stages, speed
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
+    distinct_vertices,
     find_exponent,
-    fixed_vertices,
     target_positions,
     to_complex,
 )
@@ -111,7 +111,7 @@ def check_pins(fixed: ArrayLike, target: ArrayLike, n: int) -> tuple[IntArray, F
 
     ValueError if no vertex is given, an index is out of range or repeated, or a position is missing or not finite.
     """
-    vertices = fixed_vertices(fixed, n)
+    vertices = distinct_vertices("fixed", fixed, n)
     if not vertices.size:
         raise ValueError("fixed has no vertex: omit fixed and target, or give at least one vertex")
     return vertices, target_positions(target, vertices.size)

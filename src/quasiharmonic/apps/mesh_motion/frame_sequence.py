@@ -228,11 +228,11 @@ def animate(problem: Problem, targets: Iterable[ArrayLike], **options: Unpack[An
     (True, True)
     """
     checked = AnimationOptions(**options)
-    energy = None if checked.polish is None else find_energy(checked.polish)
+    energy = None if checked.polish is None else find_energy(checked.polish, "polish")
     check_problem("animate", problem)
     limit = checked.max_motion_ratio
     if limit is not None and energy is None:
-        raise ValueError("max_motion_ratio applies only to polished frames: give an energy as well")
+        raise ValueError("max_motion_ratio applies only to polished frames: give an energy as well, by polish")
     positions = check_targets(targets, len(problem.fixed))
     following = FrameSearch(problem, positions, checked)
     frames = following.run()

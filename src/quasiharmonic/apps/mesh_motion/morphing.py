@@ -38,7 +38,15 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.io.accepts_mesh import accepts_planar_mesh
 from quasiharmonic.linsolve import check_name
 from quasiharmonic.problem.result import Status, Step
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_finite, map_array, reject, vertex_indices
+from quasiharmonic.util.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    check_finite,
+    distinct_vertices,
+    map_array,
+    reject,
+)
 from quasiharmonic.util.options import MorphOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
@@ -224,7 +232,7 @@ def _find_fixed(
     points: FloatArray, F: IntArray, moved_vertices: ArrayLike, target: ArrayLike
 ) -> tuple[IntArray, FloatArray]:
     """Return the fixed nodes (moved nodes and the rest of the boundary) and their target positions."""
-    given = vertex_indices("moved_vertices", moved_vertices, len(points))
+    given = distinct_vertices("moved_vertices", moved_vertices, len(points))
     positions = map_array("target", target, len(given), finite=False)
     check_finite("target", "row", "rows", positions)
     idle = given[~np.isin(given, F)]

@@ -45,11 +45,11 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_finite,
     check_integer,
+    distinct_vertices,
     map_array,
     reject,
     sum_at,
     triangle_array,
-    vertex_indices,
 )
 from quasiharmonic.util.options import MovingOptions, takes
 
@@ -239,7 +239,7 @@ class MovingMesh:
         reject(ratio == 0, "triangle", "triangles", "{} degenerate: repair the mesh first")
         F[ratio < 0] = F[ratio < 0][:, [0, 2, 1]]
         check_spread(F, len(self._points))
-        self._moved = vertex_indices("moved_vertices", moved_vertices, len(self._points))
+        self._moved = distinct_vertices("moved_vertices", moved_vertices, len(self._points))
         check_bool("slide", slide)
         self._slide = bool(slide)
         check_integer("settle", self._settle, minimum=1 if slide else 0)

@@ -22,7 +22,7 @@ from quasiharmonic.apps.tetrahedra.placement import (
 )
 from quasiharmonic.apps.tetrahedra.result import TetrahedraResult
 from quasiharmonic.problem.result import Step
-from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, fixed_vertices, reject, vertex_indices
+from quasiharmonic.util.arrays import FloatArray, IntArray, check_finite, distinct_vertices, reject
 from quasiharmonic.util.options import MorphOptions, TetrahedraOptions, takes
 from quasiharmonic.util.progress import reports_progress
 
@@ -95,7 +95,7 @@ def injective_tetrahedra(
     """
     X = space_array("X", X, finite=False)
     mesh = check_rest(T, X)
-    held = fixed_vertices(fixed, len(X))
+    held = distinct_vertices("fixed", fixed, len(X))
     goal = space_array("target", target, held.size)
     checked = TetrahedraOptions(**options)
     begin = None if checked.start is None else _check_positions("start", checked.start, mesh)
@@ -149,8 +149,7 @@ def find_fixed(
     mesh: RestMesh, points: FloatArray, moved_vertices: ArrayLike, slide: bool | ArrayLike
 ) -> tuple[IntArray, IntArray, Sliding]:
     """Return the moved vertices, checked, the boundary vertices that neither move nor slide, and those that slide."""
-    moved = vertex_indices("moved_vertices", moved_vertices, len(points))
-    reject(np.bincount(moved) > 1, "vertex", "vertices", "{} moved more than once: list each vertex once")
+    moved = distinct_vertices("moved_vertices", moved_vertices, len(points))
     idle = moved[~np.isin(moved, mesh.T)]
     reject(idle, "vertex", "vertices", "moved_vertices refers to {}, in no tetrahedron")
     sliding = find_sliding(mesh.faces.boundary, points, moved, slide)

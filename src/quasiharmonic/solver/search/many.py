@@ -130,7 +130,7 @@ def injective_maps(
     if isinstance(search.strategy, str):
         check_choice("strategy", search.strategy, STRATEGIES)
     if search.polish is not None:
-        find_energy(search.polish)
+        find_energy(search.polish, "polish")
     check_sequence("problems", problems, "problems")
     worker = partial(_Worker, reference, search)
     return _solve_groups(iter(problems), worker, jobs or count_cores(), errors == "raise", callback)

@@ -263,18 +263,15 @@ def select_strategy(strategy: str, **descent: Any) -> str | Stages:
 
 def stages_of(strategy: str | Stages, problem: Problem) -> Stages:
     """Return the stages of a named strategy, or the given list of stages; raise a ValueError if neither is valid."""
-    if isinstance(strategy, str):
-        if strategy not in STRATEGIES:
-            near = suggest(strategy, STRATEGIES)
-            raise ValueError(
-                f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {strategy!r}{near}"
-            )
+    if isinstance(strategy, str) and strategy in STRATEGIES:
         return STRATEGIES[strategy](problem)
     given = list(strategy) if isinstance(strategy, Sequence) else []
     stages = [stage for stage in given if isinstance(stage, SearchStage)]
     if not stages or len(stages) < len(given):
+        found = repr(strategy) if isinstance(strategy, Sequence) else describe(strategy)
         raise ValueError(
-            f"strategy must be one of {', '.join(STRATEGIES)} or a list of Descent, not {describe(strategy)}"
+            f"strategy must be one of {', '.join(STRATEGIES)} or a non-empty list of Descent, not {found}"
+            f"{suggest(strategy, STRATEGIES)}"
         )
     return stages
 

@@ -34,7 +34,7 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_non_negative,
     cyclic_pairs,
-    fixed_vertices,
+    distinct_vertices,
     invert_indices,
     reject,
     scale_to_unit,
@@ -268,7 +268,7 @@ def flattened_edges(F: ArrayLike, fixed: ArrayLike, target: ArrayLike, *, tolera
     F = triangle_rows(mesh_triangles(F))
     n = int(F.max(initial=-1)) + 1
     F = triangle_array(F, n)
-    fixed = fixed_vertices(fixed, n)
+    fixed = distinct_vertices("fixed", fixed, n)
     places = target_positions(target, len(fixed))
     found = edges(F, n)
     reject(np.setdiff1d(found.boundary, fixed), "vertex", "vertices", "the boundary {} not in fixed")

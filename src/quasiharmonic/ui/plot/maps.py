@@ -38,7 +38,7 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_range,
-    fixed_vertices,
+    distinct_vertices,
     index_array,
     loop_arrays,
     map_array,
@@ -345,7 +345,7 @@ def plot_problem(
         If an array has the wrong shape, contains an invalid index, or is not finite.
     """
     rest, F = as_mesh(V, F)
-    held = fixed_vertices(fixed, len(rest))
+    held = distinct_vertices("fixed", fixed, len(rest))
     places = np.full((len(rest), 2), np.nan)
     places[held] = scale_for_drawing(target_positions(target, len(held)))
     border, marked = boundary_edges(F, len(rest)), index_array("vertices", vertices)
