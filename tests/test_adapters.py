@@ -37,6 +37,7 @@ from quasiharmonic import (
     targets,
 )
 from quasiharmonic.apps.flattening.patterns import pattern
+from quasiharmonic.apps.gradients.layers import LayerFunctions
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.distances import surface_distances
 from quasiharmonic.io import MeshData, MeshFileError
@@ -47,6 +48,8 @@ Pair = namedtuple("Pair", ["V", "F"])
 PLANE, F = disk(3)
 V = np.column_stack([PLANE, PLANE[:, 0] * PLANE[:, 1]])
 (LOOP,) = boundary_loops(F, len(V))
+# Like `quasiharmonic.torch` and `quasiharmonic.jax`, without their packages.
+LAYERS = LayerFunctions(lambda make, settings, arguments: make(*settings))
 BEAN = PLANE[LOOP] * (1 + 0.3 * PLANE[LOOP, :1])
 
 
@@ -300,6 +303,8 @@ def test_arrays_of_other_libraries(wrap):
             r"fixed must contain integer indices, not bool: pass numpy\.flatnonzero\(fixed\)",
         ),
         (lambda: quasiharmonic.solve(MAP), "solve takes a Problem, not a MapResult"),
+        (lambda: LAYERS.injective_map(V), "injective_map takes a Problem, not a ndarray"),
+        (lambda: LAYERS.quasi_harmonic_map((V, F)), "quasi_harmonic_map takes a Problem, not a tuple"),
         (lambda: targets.boundary_to(V, F, 3), 'outline must be contours .* "letter:R", not 3'),
         (lambda: targets.boundary_to(V, F, "letter"), "unknown outline 'letter'"),
         (lambda: targets.boundary_to(V, F, [["a", "b"]] * 3), "must contain real numbers, not <U1"),

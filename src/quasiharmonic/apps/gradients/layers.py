@@ -27,7 +27,7 @@ from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.polishing import polish_options
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.reference import Reference
-from quasiharmonic.problem import Problem
+from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import solve_problem
 from quasiharmonic.solver.search.many import ManyKeywords, injective_maps
@@ -114,6 +114,7 @@ class Layer:
 
 def make_tensor_layer(problem: Problem, reference: Reference, linear_solver: str) -> Layer:
     """Return `quasiharmonic.quasi_harmonic_map` as a function of ``mu``, ``target`` and ``rest``."""
+    check_problem("quasi_harmonic_map", problem)
 
     def differentiate(arrays: Mapping[str, Array], uv: FloatArray | None) -> Derivative:
         posed = pose_problem(problem, arrays)
@@ -125,6 +126,7 @@ def make_tensor_layer(problem: Problem, reference: Reference, linear_solver: str
 
 def make_solved_layer(problem: Problem, options: SolvedKeywords) -> Layer:
     """Return `quasiharmonic.solve` with a polish as a function of ``target`` and ``rest``."""
+    check_problem("injective_map", problem)
     checked = SolvedOptions(**options)
     start = None if checked.start is None else np.asarray(checked.start, dtype=np.float64)
     checked = replace(checked, start=start)
