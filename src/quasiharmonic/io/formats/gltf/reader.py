@@ -8,6 +8,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -76,13 +77,17 @@ class CarriedGltf(Carried):
     parts: list[Primitive]
     rows: IntArray
 
-    def parts_of(self, pool: int) -> list[Primitive]:
-        """Return the primitives that use a pool, by its index."""
-        return [part for part in self.parts if part.pool == pool]
+    @cached_property
+    def parts_of(self) -> list[list[Primitive]]:
+        """The primitives that use each pool."""
+        found: list[list[Primitive]] = [[] for _ in self.pools]
+        for part in self.parts:
+            found[part.pool].append(part)
+        return found
 
     def faces_of(self, pool: int) -> IntArray:
         """Return the triangles of a pool, in the order of its primitives."""
-        return np.concatenate([np.arange(part.begin, part.end) for part in self.parts_of(pool)])
+        return np.concatenate([np.arange(part.begin, part.end) for part in self.parts_of[pool]])
 
     def number_meshes(self) -> IntArray:
         of_row = repeat_each([pool.mesh for pool in self.pools], [pool.count for pool in self.pools])

@@ -88,7 +88,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
     users, all_places = _users(carried), _convert_places(mesh.corner_uv)
     name = _channel_name(len(mesh.lower_maps))
     for number, pool in enumerate(carried.pools):
-        parts, faces = carried.parts_of(number), carried.faces_of(number)
+        parts, faces = carried.parts_of[number], carried.faces_of(number)
         primitives = [part.entry(document) for part in parts]
         places = all_places[faces]
         if np.isnan(places).all():
@@ -214,7 +214,8 @@ def _set_numbers(
         accessor = document.add(table)
     else:
         if users[accessor] > 1:
-            document.tree["accessors"].append(dict(document.tree["accessors"][accessor]))
+            old = document.tree["accessors"][accessor]
+            document.tree["accessors"].append({key: value for key, value in old.items() if key != "bufferView"})
             accessor = len(document.tree["accessors"]) - 1
             users[accessor] = 1
         document.put(accessor, table, repeated=repeated)

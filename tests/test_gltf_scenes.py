@@ -1,0 +1,65 @@
+"""Scenes of glTF files: meshes that share data, and nodes that mirror or collapse their meshes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from quasiharmonic import io
+from quasiharmonic.io.formats.gltf import document
+from shared.gltf_files import HALVES, SQUARE, Gltf, opened
+
+
+def read(made, path, **options):
+    path.write_bytes(made.glb())
+    return io.read_gltf(path, **options)
+
+
+def place(made, *nodes):
+    """Put meshes into the scene, by their nodes."""
+    made.tree |= {"nodes": list(nodes), "scenes": [{"nodes": list(range(len(nodes)))}]}
+    return made
+
+
+def write_cut(path, mesh):
+    """Write a mesh with texture coordinates of its own at each corner."""
+    F = mesh.F
+    io.write_mapped(
+        path, replace(mesh, vt=np.arange(2.0 * F.size).reshape(-1, 2), FT=np.arange(F.size).reshape(F.shape))
+    )
+    return path.read_bytes()
+
+
+def test_the_work_to_write_grows_with_the_number_of_meshes(tmp_path, monkeypatch):
+    calls = []
+    find_objects = document.find_objects
+    monkeypatch.setattr(document, "find_objects", lambda *given: calls.append(1) or find_objects(*given))
+    numbers_of_calls = []
+    for count in (20, 40):
+        made = Gltf()
+        for _ in range(count):
+            attributes = {"POSITION": made.accessor(SQUARE), "TEXCOORD_0": made.accessor(SQUARE[:, :2])}
+            made.mesh({"attributes": attributes, "indices": made.accessor(HALVES.ravel())})
+        mesh = read(made, tmp_path / "in.glb")
+        calls.clear()
+        write_cut(tmp_path / "out.glb", mesh)
+        numbers_of_calls.append(len(calls))
+    assert numbers_of_calls[1] < 3 * numbers_of_calls[0]
+
+
+def test_meshes_that_share_a_view_get_views_of_their_own_except_one(tmp_path):
+    """Only views that something else refers to are added."""
+    made = Gltf()
+    table = made.accessor(SQUARE), made.accessor(SQUARE[:, :2])
+    half = made.accessor(HALVES[0])
+    for _ in range(3):
+        made.tree["accessors"].append(dict(made.tree["accessors"][table[1]]))
+        last = len(made.tree["accessors"]) - 1
+        made.mesh({"attributes": {"POSITION": table[0], "TEXCOORD_0": last}, "indices": half})
+    made.tree["accessors"][table[1]] = dict(made.tree["accessors"][table[0]])
+    mesh = read(made, tmp_path / "in.glb")
+    data = write_cut(tmp_path / "out.glb", mesh)
+    tree = opened(data)[0]
+    assert len(tree["bufferViews"]) == len(made.tree["bufferViews"]) + 2
+    np.testing.assert_array_equal(io.read_mesh(tmp_path / "out.glb").corner_uv.ravel(), np.arange(18.0))
