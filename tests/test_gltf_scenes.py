@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from quasiharmonic import io
 from quasiharmonic.io.formats.gltf import document
-from shared.gltf_files import HALVES, SQUARE, Gltf, opened
+from shared.gltf_files import HALVES, SQUARE, Gltf, numbers, opened, square
 
 
 def read(made, path, **options):
@@ -29,6 +30,20 @@ def write_cut(path, mesh):
         path, replace(mesh, vt=np.arange(2.0 * F.size).reshape(-1, 2), FT=np.arange(F.size).reshape(F.shape))
     )
     return path.read_bytes()
+
+
+@pytest.mark.parametrize("mode", [0, 3])
+def test_points_and_lines_that_share_vertices_stay_valid(tmp_path, mode):
+    made = square()
+    triangles = made.tree["meshes"][0]["primitives"][0]
+    colours = made.accessor(SQUARE[:, :3])
+    attributes = {"POSITION": triangles["attributes"]["POSITION"], "COLOR_0": colours}
+    made.tree["meshes"][0]["primitives"].append({"attributes": attributes, "mode": mode})
+    data = write_cut(tmp_path / "out.glb", read(made, tmp_path / "in.glb"))
+    cut, other = (one["attributes"] for one in opened(data)[0]["meshes"][0]["primitives"])
+    assert len(numbers(data, cut["POSITION"])) == len(numbers(data, cut["TEXCOORD_0"])) == 6
+    np.testing.assert_array_equal(numbers(data, other["POSITION"]), SQUARE)
+    np.testing.assert_array_equal(numbers(data, other["COLOR_0"]), SQUARE)
 
 
 def test_the_work_to_write_grows_with_the_number_of_meshes(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import check_path
-from quasiharmonic.io.formats.gltf.document import Document, embed_pictures
+from quasiharmonic.io.formats.gltf.document import Document, embed_pictures, find_objects
 from quasiharmonic.io.formats.gltf.looks import paint
 from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, VertexPool
 from quasiharmonic.io.models.appearance import label_materials, materials_lost
@@ -145,13 +146,16 @@ def _has_moved(carried: CarriedGltf, number: int, places: NDArray[np.float32]) -
     return not np.array_equal(old[carried.rows[faces] - pool.first], places[faces])
 
 
-def _users(carried: CarriedGltf) -> dict[int, int]:
-    """Return the number of attributes that refer to each accessor."""
-    users: dict[int, int] = {}
-    for pool in carried.pools:
-        for accessor in (*pool.attributes.values(), *(a for target in pool.targets for a in target.values())):
-            users[accessor] = users.get(accessor, 0) + 1
-    return users
+def _users(carried: CarriedGltf) -> Counter[int]:
+    """Return the number of attributes that refer to each accessor; those of a pool count once."""
+    read = {(part.mesh, part.primitive) for part in carried.parts}
+    tables = [table for pool in carried.pools for table in (pool.attributes, *pool.targets)]
+    for m, mesh in enumerate(carried.document.tree["meshes"]):
+        for p, primitive in enumerate(mesh["primitives"]):
+            if (m, p) not in read:
+                # Any number in such a primitive may be an accessor; one user too many only causes a copy.
+                tables += find_objects(primitive, lambda node: True)
+    return Counter(accessor for table in tables for accessor in table.values() if isinstance(accessor, int))
 
 
 def _split(rows: IntArray, keys: IntArray, count: int) -> tuple[IntArray, IntArray, IntArray]:
@@ -186,7 +190,7 @@ def _extend(
     pool: VertexPool,
     primitives: list[dict[str, Any]],
     origin: IntArray,
-    users: dict[int, int],
+    users: Counter[int],
     changed: str,
 ) -> None:
     """Copy the attributes of a pool's vertices, except the changed one, to their copies."""
@@ -204,7 +208,7 @@ def _set_numbers(
     holders: list[dict[str, int]],
     name: str,
     table: NDArray[Any],
-    users: dict[int, int],
+    users: Counter[int],
     *,
     repeated: bool = False,
 ) -> None:
