@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from quasiharmonic import io
+from quasiharmonic.io import MeshFileError
 from quasiharmonic.io.formats.gltf import document
+from quasiharmonic.io.untrusted import use_bound
 from shared.gltf_files import HALVES, SQUARE, Gltf, numbers, opened, square
 
 
@@ -30,6 +32,14 @@ def write_cut(path, mesh):
         path, replace(mesh, vt=np.arange(2.0 * F.size).reshape(-1, 2), FT=np.arange(F.size).reshape(F.shape))
     )
     return path.read_bytes()
+
+
+def test_meshes_may_share_their_data_within_the_bound_of_memory(tmp_path):
+    made = place(square(), *({"mesh": 0, "translation": [2 * k, 0, 0]} for k in range(100)))
+    mesh = read(made, tmp_path / "in.glb", instances="own")
+    assert len(np.unique(mesh.V, axis=0)) == 400
+    with use_bound(100_000), pytest.raises(MeshFileError, match="repeat the same data, and need"):
+        io.read_gltf(tmp_path / "in.glb", instances="own")
 
 
 @pytest.mark.parametrize("mode", [0, 3])

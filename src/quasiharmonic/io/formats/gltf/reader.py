@@ -18,6 +18,7 @@ from quasiharmonic.geometry.mesh.splitting import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
 from quasiharmonic.io.models.meshdata import Carried, MeshData, normal_lines
+from quasiharmonic.io.untrusted import check_size
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_choice, count_of, repeat_each
 from quasiharmonic.util.options import INSTANCES
 
@@ -27,6 +28,8 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # Volumes with a smaller ratio are equal, up to rounding.
 _LARGER = 1 + 1e-9
 _READ = "POSITION", "NORMAL", "COLOR_0", PLACES
+# Memory to read a triangle or a vertex, roughly.
+_BYTES_TO_READ = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +184,7 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
     """Return pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
     tree, pools, parts, known = document.tree, list[VertexPool](), list[Primitive](), dict[str, int]()
     triangles, statements, vertices, faces, named = [np.empty((0, 3), dtype=np.int64)], [], 0, 0, False
-    materials = list[bytes]()
+    materials, size = list[bytes](), document.size
     for m, mesh in enumerate(tree.get("meshes", [])):
         for p, primitive in enumerate(mesh["primitives"]):
             attributes, targets = primitive["attributes"], primitive.get("targets", [])
@@ -203,8 +206,8 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
             if corners.size and corners.max() >= pool.count:
                 raise ValueError(f"mesh {m} refers to vertex {corners.max()}, but there are {pool.count}")
             own = _triangles(corners, mode)
-            if faces + len(own) + vertices > document.size:
-                raise ValueError("its meshes repeat the same data too often")
+            if (rows := faces + len(own) + vertices) > size:
+                check_size(_BYTES_TO_READ * rows, "its meshes repeat the same data, and need")
             parts.append(Primitive(m, p, known[key], faces, faces + len(own)))
             if p == 0 and isinstance(mesh.get("name"), str):
                 statements.append((_statement("o", mesh["name"]), faces))
