@@ -11,6 +11,7 @@ from quasiharmonic import io
 from quasiharmonic.io import MeshFileError
 from quasiharmonic.io.formats.gltf import document
 from quasiharmonic.io.untrusted import use_bound
+from quasiharmonic.surfaces import cat
 from shared.gltf_files import HALVES, SQUARE, Gltf, numbers, opened, square
 
 
@@ -54,6 +55,31 @@ def test_points_and_lines_that_share_vertices_stay_valid(tmp_path, mode):
     assert len(numbers(data, cut["POSITION"])) == len(numbers(data, cut["TEXCOORD_0"])) == 6
     np.testing.assert_array_equal(numbers(data, other["POSITION"]), SQUARE)
     np.testing.assert_array_equal(numbers(data, other["COLOR_0"]), SQUARE)
+
+
+def test_a_mirrored_mesh_faces_outwards_and_its_triangles_stay_in_the_file(tmp_path):
+    V, F = cat(4)
+    made = Gltf()
+    normals = np.tile(np.array([[0, 0, 1]], "f4"), (len(V), 1))
+    attributes = {"POSITION": made.accessor(V.astype("f4")), "NORMAL": made.accessor(normals)}
+    made.mesh({"attributes": attributes, "indices": made.accessor(F.ravel().astype("u2"))})
+    mesh = read(place(made, {"mesh": 0, "scale": [1, 1, -2]}), tmp_path / "in.glb")
+    np.testing.assert_array_equal(mesh.F, F[:, [0, 2, 1]])
+    assert {float(line.split()[3]) for line in mesh.normals.splitlines()} == {-1}
+    data = write_cut(tmp_path / "out.glb", mesh)
+    (primitive,) = opened(data)[0]["meshes"][0]["primitives"]
+    rows = numbers(data, primitive["indices"]).reshape(-1, 3)
+    np.testing.assert_array_equal(numbers(data, primitive["attributes"]["POSITION"])[rows], V.astype("f4")[F])
+    again = io.read_mesh(tmp_path / "out.glb")
+    np.testing.assert_array_equal(again.F, mesh.F)
+    np.testing.assert_array_equal(again.corner_uv.ravel(), np.arange(2.0 * F.size))
+
+
+@pytest.mark.parametrize(("scale", "size"), [([0, 0, 0], 1), ([0, 0, 3], 1), ([3, 3, 0], 3)])
+def test_a_mesh_that_its_node_collapses_keeps_its_own_size(tmp_path, scale, size):
+    made = place(square(), {"mesh": 0, "scale": scale, "translation": [5, 0, 0]})
+    mesh = read(made, tmp_path / "in.glb")
+    np.testing.assert_array_equal(mesh.V, size * SQUARE + np.array([5, 0, 0]))
 
 
 def test_the_work_to_write_grows_with_the_number_of_meshes(tmp_path, monkeypatch):

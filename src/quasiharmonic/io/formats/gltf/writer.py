@@ -106,7 +106,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
             bounds = np.cumsum([part.end - part.begin for part in parts])[:-1]
             for primitive, own in zip(primitives, np.split(rows, bounds), strict=True):
                 primitive["mode"] = 4
-                primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
+                primitive["indices"] = document.add(_indices(pool.orient(own), len(origin)), indices=True)
         # Channels below that the pool lacks have the same coordinates.
         lacking = [low for low in map(_channel_name, range(len(mesh.lower_maps))) if low not in pool.attributes]
         for one in (*lacking, name):
