@@ -12,6 +12,7 @@ from quasiharmonic.io import MeshFileError
 from quasiharmonic.io.formats.gltf import document
 from quasiharmonic.io.untrusted import use_bound
 from quasiharmonic.surfaces import cat
+from quasiharmonic.ui.cli import main
 from shared.gltf_files import HALVES, SQUARE, Gltf, numbers, opened, square
 
 
@@ -80,6 +81,21 @@ def test_a_mesh_that_its_node_collapses_keeps_its_own_size(tmp_path, scale, size
     made = place(square(), {"mesh": 0, "scale": scale, "translation": [5, 0, 0]})
     mesh = read(made, tmp_path / "in.glb")
     np.testing.assert_array_equal(mesh.V, size * SQUARE + np.array([5, 0, 0]))
+
+
+def test_instances_of_an_extension_in_a_lightmap_are_reported(tmp_path, capsys):
+    name = "EXT_mesh_gpu_instancing"
+    made = square()
+    place(made, {"mesh": 0, "extensions": {name: {"attributes": {"TRANSLATION": 0}}}})
+    made.tree["extensionsUsed"] = [name]
+    (tmp_path / "in.glb").write_bytes(made.glb())
+    command = ["unwrap", str(tmp_path / "in.glb"), "--resolution", "64", "-o"]
+    assert main([*command, str(tmp_path / "out.glb"), "--lightmap"]) == 0
+    assert f"instances of {name} share their texture coordinates" in capsys.readouterr().err
+    assert main([*command, str(tmp_path / "out.glb")]) == 0
+    assert name not in capsys.readouterr().err
+    assert main([*command, str(tmp_path / "out.ply")]) == 0
+    assert f"will not have: instances of {name}" in capsys.readouterr().err
 
 
 def test_the_work_to_write_grows_with_the_number_of_meshes(tmp_path, monkeypatch):

@@ -29,6 +29,9 @@ _LARGER = 1 + 1e-9
 _READ = "POSITION", "NORMAL", "COLOR_0", PLACES
 # Memory to read a triangle or a vertex, roughly.
 _BYTES_TO_READ = 200
+_GPU = "EXT_mesh_gpu_instancing"
+#: What `CarriedGltf.further` lists if an extension repeats meshes.
+GPU_INSTANCES = f"instances of {_GPU}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +119,8 @@ class CarriedGltf(Carried):
         used = [node["mesh"] for node in tree.get("nodes", []) if "mesh" in node]
         if more := len(used) - len(set(used)):
             found.append(f"{count_of('further occurrence', 'further occurrences', more)} of meshes in the scene")
+        if _GPU in str(tree.get("extensionsUsed")):
+            found.append(GPU_INSTANCES)
         names = sorted({name for pool in self.pools for name in pool.attributes if name not in _READ})
         return found + [f"{name} of vertices" for name in names]
 
