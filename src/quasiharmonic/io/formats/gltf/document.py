@@ -10,9 +10,11 @@ import base64
 import binascii
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +107,8 @@ class Document:
             raw = np.pad(raw, ((0, 0), (0, padding)))
             view["byteStride"] = raw.shape[1]
         views = self.tree.setdefault("bufferViews", [])
-        if old is None or self._count_references(old) > 1:
+        if old is None or self._references[old] > 1:
+            self._references[old] -= 1
             old = len(views)
             views.append({})
             self.views.append(b"")
@@ -141,9 +144,11 @@ class Document:
         body = b"".join(len(data).to_bytes(4, "little") + name + data for name, data in chunks)
         return b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
 
-    def _count_references(self, view: int) -> int:
-        """Return the number of references to a view."""
-        return sum(1 for _ in find_objects(self.tree, lambda node: node.get("bufferView") == view))
+    @cached_property
+    def _references(self) -> Counter[int | None]:
+        """The number of references to each view; `put` keeps it up to date."""
+        holders = find_objects(self.tree, lambda node: isinstance(node.get("bufferView"), int))
+        return Counter(node["bufferView"] for node in holders)
 
     def _rows(self, where: dict[str, Any], count: int, kind: np.dtype[Any], width: int) -> NDArray[Any]:
         """Return a copy of rows of numbers in a view."""

@@ -6,8 +6,8 @@ import copy
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from quasiharmonic.geometry.mesh.splitting import weld_points
 from quasiharmonic.io.errors import MeshFileError, report_damage
 from quasiharmonic.io.formats.gltf.document import DAMAGE, Document, fault, load, whole
 from quasiharmonic.io.models.meshdata import Carried, MeshData, normal_lines
+from quasiharmonic.io.untrusted import check_size
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, check_choice, count_of, repeat_each
 from quasiharmonic.util.options import INSTANCES
 
@@ -26,6 +27,11 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # Volumes with a smaller ratio are equal, up to rounding.
 _LARGER = 1 + 1e-9
 _READ = "POSITION", "NORMAL", "COLOR_0", PLACES
+# Memory to read a triangle or a vertex, roughly.
+_BYTES_TO_READ = 200
+_GPU = "EXT_mesh_gpu_instancing"
+#: What `CarriedGltf.further` lists if an extension repeats meshes.
+GPU_INSTANCES = f"instances of {_GPU}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +46,17 @@ class VertexPool:
     #: Index of the first vertex among those of all pools, and number of vertices.
     first: int
     count: int
+    #: Transformation (4, 4) in the scene; None for the identity.
+    matrix: FloatArray | None
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the transformation is a reflection."""
+        return self.matrix is not None and float(np.linalg.det(self.matrix[:3, :3])) < 0
+
+    def orient(self, triangles: IntArray) -> IntArray:
+        """Return triangles (k, 3) of the file as in the scene, where a reflection reverses them; its own inverse."""
+        return triangles[:, [0, 2, 1]] if self.is_mirrored else triangles
 
     @property
     def rows(self) -> slice:
@@ -76,13 +93,17 @@ class CarriedGltf(Carried):
     parts: list[Primitive]
     rows: IntArray
 
-    def parts_of(self, pool: int) -> list[Primitive]:
-        """Return the primitives that use a pool, by its index."""
-        return [part for part in self.parts if part.pool == pool]
+    @cached_property
+    def parts_of(self) -> list[list[Primitive]]:
+        """The primitives that use each pool."""
+        found: list[list[Primitive]] = [[] for _ in self.pools]
+        for part in self.parts:
+            found[part.pool].append(part)
+        return found
 
     def faces_of(self, pool: int) -> IntArray:
         """Return the triangles of a pool, in the order of its primitives."""
-        return np.concatenate([np.arange(part.begin, part.end) for part in self.parts_of(pool)])
+        return np.concatenate([np.arange(part.begin, part.end) for part in self.parts_of[pool]])
 
     def number_meshes(self) -> IntArray:
         of_row = repeat_each([pool.mesh for pool in self.pools], [pool.count for pool in self.pools])
@@ -98,6 +119,8 @@ class CarriedGltf(Carried):
         used = [node["mesh"] for node in tree.get("nodes", []) if "mesh" in node]
         if more := len(used) - len(set(used)):
             found.append(f"{count_of('further occurrence', 'further occurrences', more)} of meshes in the scene")
+        if _GPU in str(tree.get("extensionsUsed")):
+            found.append(GPU_INSTANCES)
         names = sorted({name for pool in self.pools for name in pool.attributes if name not in _READ})
         return found + [f"{name} of vertices" for name in names]
 
@@ -106,7 +129,8 @@ def read_gltf(path: str | os.PathLike[str], *, instances: str = "share") -> Mesh
     """Read the triangles of a glTF 2.0 file, binary (.glb) or JSON (.gltf).
 
     A vertex of a glTF file has one texture coordinate, so vertices are repeated along seams. Vertices of one mesh at
-    exactly equal positions are merged, and the texture coordinates keep the seams. Positions are those in the scene.
+    exactly equal positions are merged, and the texture coordinates keep the seams. Positions are those in the scene,
+    where a reflection reverses the triangles.
 
     Parameters
     ----------
@@ -162,7 +186,7 @@ def _mesh(document: Document, source: str) -> MeshData | None:
         vt=vt if known.any() else None,
         FT=np.where(known[rows], rows, -1) if known.any() else None,
         extra=extra if coloured.any() else None,
-        normals=normal_lines(_transform_normals(document, pools, normals)) if shaded.any() else b"",
+        normals=normal_lines(_transform_normals(pools, normals)) if shaded.any() else b"",
         FN=np.where(shaded[rows], rows, -1) if shaded.any() else None,
         statements=b"".join(line for line, _ in statements),
         statement_faces=np.array([face for _, face in statements], dtype=np.int64),
@@ -175,8 +199,9 @@ def _mesh(document: Document, source: str) -> MeshData | None:
 def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntArray, list[tuple[bytes, int]]]:
     """Return pools, parts, the vertices of every triangle among those of all pools, and statements with their faces."""
     tree, pools, parts, known = document.tree, list[VertexPool](), list[Primitive](), dict[str, int]()
+    placed = _placements(tree)
     triangles, statements, vertices, faces, named = [np.empty((0, 3), dtype=np.int64)], [], 0, 0, False
-    materials = list[bytes]()
+    materials, size = list[bytes](), document.size
     for m, mesh in enumerate(tree.get("meshes", [])):
         for p, primitive in enumerate(mesh["primitives"]):
             attributes, targets = primitive["attributes"], primitive.get("targets", [])
@@ -188,7 +213,7 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
             if key not in known:
                 known[key] = len(pools)
                 count = _common_count(document, [attributes, *targets])
-                pools.append(VertexPool(attributes, targets, m, vertices, count))
+                pools.append(VertexPool(attributes, targets, m, vertices, count, placed.get(m)))
                 vertices += count
             pool = pools[known[key]]
             if "indices" not in primitive:
@@ -198,8 +223,8 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
             if corners.size and corners.max() >= pool.count:
                 raise ValueError(f"mesh {m} refers to vertex {corners.max()}, but there are {pool.count}")
             own = _triangles(corners, mode)
-            if faces + len(own) + vertices > document.size:
-                raise ValueError("its meshes repeat the same data too often")
+            if (rows := faces + len(own) + vertices) > size:
+                check_size(_BYTES_TO_READ * rows, "its meshes repeat the same data, and need")
             parts.append(Primitive(m, p, known[key], faces, faces + len(own)))
             if p == 0 and isinstance(mesh.get("name"), str):
                 statements.append((_statement("o", mesh["name"]), faces))
@@ -214,7 +239,7 @@ def _parts(document: Document) -> tuple[list[VertexPool], list[Primitive], IntAr
                 # A statement is valid until the next one.
                 statements.append((_statement("usemtl", ""), faces))
                 named = False
-            triangles.append(pool.first + own)
+            triangles.append(pool.first + pool.orient(own))
             faces += len(own)
     return pools, parts, np.concatenate(triangles), statements
 
@@ -298,28 +323,25 @@ def read_corners(carried: CarriedGltf, name: str, width: int | None) -> FloatArr
 def _positions(document: Document, pools: list[VertexPool]) -> tuple[FloatArray, FloatArray]:
     """Return positions (v, 3) in the scene, and the mesh (v,) of each."""
     points, _ = _attribute(document, pools, "POSITION", 3)
-    for rows, matrix in _moved_rows(document, pools):
-        points[rows] = points[rows] @ matrix[:3, :3].T + matrix[:3, 3]
+    for pool in pools:
+        if pool.matrix is not None:
+            points[pool.rows] = points[pool.rows] @ pool.matrix[:3, :3].T + pool.matrix[:3, 3]
     return points, repeat_each([pool.mesh for pool in pools], [pool.count for pool in pools]).astype(np.float64)
 
 
-def _transform_normals(document: Document, pools: list[VertexPool], normals: FloatArray) -> FloatArray:
+def _transform_normals(pools: list[VertexPool], normals: FloatArray) -> FloatArray:
     """Return normals (v, 3) in the scene, of unit length if a transformation was applied."""
-    for rows, matrix in _moved_rows(document, pools):
-        # Normals transform by the cofactor matrix, which also exists for singular matrices.
-        cofactors = np.stack([np.cross(matrix[(i + 1) % 3, :3], matrix[(i + 2) % 3, :3]) for i in range(3)])
-        turned = normals[rows] @ cofactors.T
-        length = np.linalg.norm(turned, axis=1, keepdims=True)
-        normals[rows] = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0)
+    for pool in pools:
+        if pool.matrix is not None:
+            turned = normals[pool.rows] @ _cofactors(pool.matrix).T * (-1 if pool.is_mirrored else 1)
+            length = np.linalg.norm(turned, axis=1, keepdims=True)
+            normals[pool.rows] = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0)
     return normals
 
 
-def _moved_rows(document: Document, pools: list[VertexPool]) -> Iterator[tuple[slice, FloatArray]]:
-    """Yield the vertices of each pool whose mesh is transformed in the scene, and the transformation (4, 4)."""
-    placed = _placements(document.tree)
-    for pool in pools:
-        if pool.mesh in placed:
-            yield pool.rows, placed[pool.mesh]
+def _cofactors(matrix: FloatArray) -> FloatArray:
+    """Return the matrix (3, 3) that transforms areas; it also exists for singular matrices (4, 4)."""
+    return np.stack([np.cross(matrix[(i + 1) % 3, :3], matrix[(i + 2) % 3, :3]) for i in range(3)])
 
 
 def _separate_instances(tree: dict[str, Any]) -> None:
@@ -337,7 +359,8 @@ def _separate_instances(tree: dict[str, Any]) -> None:
 def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
     """Return the transformation (4, 4) of each mesh in the scene, without identities.
 
-    Of several nodes, the one at which the mesh is largest counts, so that its texel density suffices for all.
+    Of several nodes, the one at which the mesh is largest counts, so that its texel density suffices for all. A mesh
+    that a scale of 0 collapses, often at the start of an animation, keeps its own size.
     """
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes", [])
@@ -358,6 +381,9 @@ def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
             if mesh not in placed or _volume(matrix) > _LARGER * _volume(placed[mesh]):
                 placed[mesh] = matrix
         waiting += [(whole(child), here) for child in reversed(node.get("children", []))]
+    for matrix in placed.values():
+        if not _volume(matrix) and not _cofactors(matrix).any():
+            matrix[:3, :3] = np.eye(3)
     return {mesh: matrix for mesh, matrix in placed.items() if not np.array_equal(matrix, np.eye(4))}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from quasiharmonic.io.atomic import write_whole
 from quasiharmonic.io.errors import check_path
-from quasiharmonic.io.formats.gltf.document import Document, embed_pictures
+from quasiharmonic.io.formats.gltf.document import Document, embed_pictures, find_objects
 from quasiharmonic.io.formats.gltf.looks import paint
 from quasiharmonic.io.formats.gltf.reader import PLACES, CarriedGltf, VertexPool
 from quasiharmonic.io.models.appearance import label_materials, materials_lost
@@ -88,7 +89,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
     users, all_places = _users(carried), _convert_places(mesh.corner_uv)
     name = _channel_name(len(mesh.lower_maps))
     for number, pool in enumerate(carried.pools):
-        parts, faces = carried.parts_of(number), carried.faces_of(number)
+        parts, faces = carried.parts_of[number], carried.faces_of(number)
         primitives = [part.entry(document) for part in parts]
         places = all_places[faces]
         if np.isnan(places).all():
@@ -105,7 +106,7 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
             bounds = np.cumsum([part.end - part.begin for part in parts])[:-1]
             for primitive, own in zip(primitives, np.split(rows, bounds), strict=True):
                 primitive["mode"] = 4
-                primitive["indices"] = document.add(_indices(own, len(origin)), indices=True)
+                primitive["indices"] = document.add(_indices(pool.orient(own), len(origin)), indices=True)
         # Channels below that the pool lacks have the same coordinates.
         lacking = [low for low in map(_channel_name, range(len(mesh.lower_maps))) if low not in pool.attributes]
         for one in (*lacking, name):
@@ -145,13 +146,16 @@ def _has_moved(carried: CarriedGltf, number: int, places: NDArray[np.float32]) -
     return not np.array_equal(old[carried.rows[faces] - pool.first], places[faces])
 
 
-def _users(carried: CarriedGltf) -> dict[int, int]:
-    """Return the number of attributes that refer to each accessor."""
-    users: dict[int, int] = {}
-    for pool in carried.pools:
-        for accessor in (*pool.attributes.values(), *(a for target in pool.targets for a in target.values())):
-            users[accessor] = users.get(accessor, 0) + 1
-    return users
+def _users(carried: CarriedGltf) -> Counter[int]:
+    """Return the number of attributes that refer to each accessor; those of a pool count once."""
+    read = {(part.mesh, part.primitive) for part in carried.parts}
+    tables = [table for pool in carried.pools for table in (pool.attributes, *pool.targets)]
+    for m, mesh in enumerate(carried.document.tree["meshes"]):
+        for p, primitive in enumerate(mesh["primitives"]):
+            if (m, p) not in read:
+                # Any number in such a primitive may be an accessor; one user too many only causes a copy.
+                tables += find_objects(primitive, lambda node: True)
+    return Counter(accessor for table in tables for accessor in table.values() if isinstance(accessor, int))
 
 
 def _split(rows: IntArray, keys: IntArray, count: int) -> tuple[IntArray, IntArray, IntArray]:
@@ -186,7 +190,7 @@ def _extend(
     pool: VertexPool,
     primitives: list[dict[str, Any]],
     origin: IntArray,
-    users: dict[int, int],
+    users: Counter[int],
     changed: str,
 ) -> None:
     """Copy the attributes of a pool's vertices, except the changed one, to their copies."""
@@ -204,7 +208,7 @@ def _set_numbers(
     holders: list[dict[str, int]],
     name: str,
     table: NDArray[Any],
-    users: dict[int, int],
+    users: Counter[int],
     *,
     repeated: bool = False,
 ) -> None:
@@ -214,7 +218,8 @@ def _set_numbers(
         accessor = document.add(table)
     else:
         if users[accessor] > 1:
-            document.tree["accessors"].append(dict(document.tree["accessors"][accessor]))
+            old = document.tree["accessors"][accessor]
+            document.tree["accessors"].append({key: value for key, value in old.items() if key != "bufferView"})
             accessor = len(document.tree["accessors"]) - 1
             users[accessor] = 1
         document.put(accessor, table, repeated=repeated)

@@ -23,7 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quasiharmonic.ui.cli import pipeline, written_map
+from quasiharmonic.ui.cli import pipeline, process, written_map
 from quasiharmonic.ui.cli.arguments import (
     add_files,
     add_options,
@@ -139,7 +139,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _read(options: argparse.Namespace, source: Path) -> MeshData:
     """Read the model within the limit of memory."""
-    from quasiharmonic.io.formats.gltf.reader import read_gltf
+    from quasiharmonic.io.formats.gltf.reader import GPU_INSTANCES, read_gltf
     from quasiharmonic.io.untrusted import use_bound
 
     has_instances = source.suffix.lower() in (".glb", ".gltf")
@@ -151,7 +151,10 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
         if options.texture is not None:
             word = "--lightmap" if options.lightmap else "--instances"
             raise ValueError(f"--texture makes one material for all meshes: omit --texture or {word}")
-        return read_gltf(source, instances="own")
+        mesh = read_gltf(source, instances="own")
+        if mesh.carried is not None and GPU_INSTANCES in mesh.carried.further():
+            process.tell(f"{GPU_INSTANCES} share their texture coordinates: to separate them, save each as a node")
+        return mesh
 
 
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
