@@ -222,9 +222,8 @@ def pack_charts(
                 f"use less padding{'' if texels_per_unit is None else ', or fewer texels per unit'}"
             )
         sufficient = f"{width} × {height} texels" if width != height else f"resolution={width}"
-        raise ValueError(
-            f"{no_fit} {f'{tiles} tiles of ' if tiles > 1 else ''}{size[0]} × {size[1]} texels: {sufficient} suffices"
-        )
+        into_all = f"{f'{tiles} tiles of ' if tiles > 1 else ''}{size[0]} × {size[1]} texels"
+        raise ValueError(f"{no_fit} {into_all}: {sufficient} suffices for these charts")
     placed = {i: _place(shape, layout, k) for k, (i, shape) in enumerate(zip(originals, shapes, strict=True))}
     for i, copy in copies.items():
         placed[i] = _place_copy(copy.motion, placed[copy.original], layout.scale)
