@@ -134,7 +134,9 @@ def test_colours_that_are_none_are_named_and_their_number_is_checked():
 def test_triangles_that_leave_the_unit_square_are_counted():
     V, F = np.array(CORNERS, float), np.array([[0, 1, 2], [0, 2, 3]])
     old = io.MeshData(V, F)
-    assert "2 triangles reach beyond the unit square" in bake(old, old.with_map(3 * V[:, :2] - 1), size=4).problems[0]
+    baked = bake(old, old.with_map(3 * V[:, :2] - 1), size=4)
+    assert "2 triangles reach beyond the unit square" in baked.problems[0]
+    assert "correct the models as listed" in baked.message
     assert bake(old, old.with_map(V[:, :2] * (1 + 1e-9)), size=4).success
     with pytest.raises(ValueError, match="no texture coordinates in the unit square"):
         bake(old, old.with_map(V[:, :2] + [1, 0]), size=4)
