@@ -52,6 +52,17 @@ def test_a_name_with_a_blank_is_not_that_of_another_file(tmp_path):
     assert "my t.png" in result.problems[0]
 
 
+@pytest.mark.parametrize("library", ["gone.mtl", "../m.mtl", "other.mtl"])
+def test_a_material_that_no_library_in_the_folder_has_is_listed(tmp_path, library):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "m.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    (tmp_path / "sub/other.mtl").write_text("newmtl n\nKd 1 0 0\n")
+    text = f"mtllib {library}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    (tmp_path / "sub/a.obj").write_text(text)
+    old = io.read_mesh(tmp_path / "sub/a.obj")
+    assert bake(old, old, size=4).problems == ("material m is in no material library in the folder of the file",)
+
+
 def test_an_image_is_repeated_and_shifted(tmp_path):
     old = with_material(tmp_path, "map_Kd -s 2 1 -o 0 0.5 t.png", "t.png")
     result = bake(old, old, size=(8, 4))
@@ -123,7 +134,9 @@ def test_colours_that_are_none_are_named_and_their_number_is_checked():
 def test_triangles_that_leave_the_unit_square_are_counted():
     V, F = np.array(CORNERS, float), np.array([[0, 1, 2], [0, 2, 3]])
     old = io.MeshData(V, F)
-    assert "2 triangles reach beyond the unit square" in bake(old, old.with_map(3 * V[:, :2] - 1), size=4).problems[0]
+    baked = bake(old, old.with_map(3 * V[:, :2] - 1), size=4)
+    assert "2 triangles reach beyond the unit square" in baked.problems[0]
+    assert "correct the models as listed" in baked.message
     assert bake(old, old.with_map(V[:, :2] * (1 + 1e-9)), size=4).success
     with pytest.raises(ValueError, match="no texture coordinates in the unit square"):
         bake(old, old.with_map(V[:, :2] + [1, 0]), size=4)

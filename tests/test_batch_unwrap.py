@@ -17,6 +17,7 @@ from quasiharmonic import batch, io, unwrap
 from quasiharmonic.surfaces import starfish
 from shared.commands import linux, run
 from shared.datasets import record_of
+from shared.gltf_files import square, touching_squares
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("quick_workers")]
 
@@ -108,6 +109,30 @@ def test_archives_and_shards(models, tmp_path):
         batch.run(models, tmp_path / "shards", settings(), jobs=1, shard=shard)
     merged = batch.merge([tmp_path / "shards"], tmp_path / "shards")
     assert (merged.total, merged.solved) == (4, 2)
+
+
+def test_meshes_and_instances_of_gltf_files_are_distinguished(tmp_path):
+    """As `unwrap` of the file does; a lightmap has a place for each occurrence of a mesh."""
+    made = square()
+    made.tree["nodes"] = [{"mesh": 0}, {"mesh": 0, "translation": [2, 0, 0]}]
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set/touching.glb").write_bytes(touching_squares().glb())
+    (tmp_path / "set/twice.glb").write_bytes(made.glb())
+    batch.run(tmp_path / "set", tmp_path / "out", settings(lightmap=True), jobs=1)
+    assert record_of(tmp_path / "out", "touching.glb")["charts"] == 2
+    assert record_of(tmp_path / "out", "twice.glb")["vertices"] == 8
+    assert len(io.read_mesh(tmp_path / "out/results/twice.glb/map.obj").V) == 8
+
+
+def test_options_may_refer_to_the_file(tmp_path):
+    (tmp_path / "set").mkdir()
+    text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nusemtl a\ns 1\nf 1 2 3\nusemtl b\ns 2\nf 1 3 4\n"
+    (tmp_path / "set/two.obj").write_text(text)
+    batch.run(tmp_path / "set", tmp_path / "tiles", settings(tile_by="material"), jobs=1)
+    vt = io.read_mesh(tmp_path / "tiles/results/two.obj/map.obj").vt
+    assert set(np.floor(vt[:, 0])) == {0, 1}
+    batch.run(tmp_path / "set", tmp_path / "edges", settings(hard_edges="file"), jobs=1)
+    assert record_of(tmp_path / "edges", "two.obj")["charts"] == 2
 
 
 def test_the_command_reports_charts_and_cleaning(models, tmp_path, capsys):

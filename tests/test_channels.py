@@ -93,7 +93,10 @@ def test_tangents_stay_because_they_belong_to_the_first_channel(tmp_path):
     ("options", "words"),
     [
         (["out.obj", "--channel", 1], "cannot store several texture coordinates"),
-        (["out.glb", "--channel", 2], "has no texture coordinates 1"),
+        (
+            ["out.glb", "--channel", 2],
+            "give a channel of the file (the first is 0), or write channel 1 first",
+        ),
         (["out.glb", "--keep-seams", "--seams-channel", 1], "has no texture coordinates 1"),
         (["out.glb", "--seams-channel", 1], "--seams-channel needs --keep-seams: add --keep-seams, or omit"),
         (["out.glb", "--channel", 1, "--texture", "checkerboard"], "omit --bake and --texture"),

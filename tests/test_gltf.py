@@ -112,6 +112,24 @@ def test_shared_data_does_not_change(tmp_path):
         )
 
 
+def test_a_mesh_that_was_turned_over_keeps_the_data_of_its_file(tmp_path):
+    made = square(TEXCOORD_0=SQUARE[:, :2], NORMAL=np.tile(np.float32([0, 0, 1]), (4, 1)))
+    made.tree["materials"] = [{"name": "paint"}]
+    made.tree["meshes"][0]["primitives"][0]["material"] = 0
+    made.tree["nodes"] = [{"mesh": 0, "name": "here", "translation": [1, 2, 3]}]
+    mesh = read(made, tmp_path)
+    turned = mesh.turn_over()
+    assert io.not_held("out.glb", turned) == []
+    io.write_mapped(tmp_path / "out.glb", turned)
+    again, data = io.read_mesh(tmp_path / "out.glb"), (tmp_path / "out.glb").read_bytes()
+    np.testing.assert_array_equal(again.F, mesh.F[:, (0, 2, 1)])
+    np.testing.assert_array_equal(again.corner_uv, mesh.corner_uv[:, (0, 2, 1)])
+    tree = opened(data)[0]
+    assert [tree[name] for name in ("materials", "nodes")] == [made.tree[name] for name in ("materials", "nodes")]
+    normals = numbers(data, tree["meshes"][0]["primitives"][0]["attributes"]["NORMAL"])
+    np.testing.assert_array_equal(normals, np.tile([0, 0, -1], (4, 1)))
+
+
 def test_vertices_are_split_along_seams_with_all_attributes(tmp_path):
     colours = np.arange(12, dtype="u1").reshape(4, 3) * 10
     made = square(TEXCOORD_0=SQUARE[:, :2], COLOR_0=colours)

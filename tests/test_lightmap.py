@@ -196,6 +196,8 @@ def test_materials_of_files_and_of_trimesh_have_tiles(tmp_path):
     np.testing.assert_array_equal(tile, np.repeat([0, 1], [4, 8]))
     result = unwrap(source, tile_by="material")
     np.testing.assert_array_equal(np.floor(result.uvs[result.indices][:, 0, 0]), tile)
+    with pytest.raises(ValueError, match="with a padding of 4 texels do not fit"):
+        unwrap(source, tile_by="material", texels_per_unit=1e4)
     trimesh = pytest.importorskip("trimesh")
     meshes = [trimesh.Trimesh(*ROOM, process=False) for _ in range(3)]
     for mesh, name in zip(meshes, ["a", "b", "a"], strict=True):

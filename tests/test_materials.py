@@ -317,6 +317,7 @@ def test_names_of_textures_are_those_that_use_the_map(tmp_path):
     io.write_mapped(model, MeshData(V, F, texture=io.checkerboard()).with_map(V[:, :2]))
     mesh = io.read_mesh(model)
     tree = mesh.carried.document.tree
+    tree["meshes"][0]["primitives"][0]["material"] = 0
     tree["images"] = [{"uri": f"{k}.png"} for k in range(6)] + [{"name": "seven", "uri": "7.png"}, {"bufferView": 0}]
     tree["textures"] = [{"source": k} for k in range(8)]
     tree["textures"][5]["extensions"] = {"EXT_texture_webp": {"source": 4}}
@@ -330,7 +331,8 @@ def test_names_of_textures_are_those_that_use_the_map(tmp_path):
         },
         {"emissiveTexture": {"index": 7}},
     ]
-    assert io.texture_names(mesh) == ["0.png", "2.png", "5.png", "4.png", "seven", "image 7"]
+    assert io.texture_names(mesh) == ["0.png", "2.png", "5.png", "4.png", "seven"]
+    assert io.texture_names(mesh, 1) == ["1.png"]
     for damaged in ({"index": 99}, {"index": "x"}, {"index": 0, "extensions": 3}):
         tree["materials"] = [{"normalTexture": damaged}]
         assert io.texture_names(mesh) == []

@@ -131,6 +131,7 @@ def test_rows_of_numbers_in_every_usual_notation(tmp_path, text, rows):
         ("1,2,1_0\n", "'1_0' is not a finite number"),
         ("1,2,3d\n", "'3d' is not a finite number"),
         ("1;2.5;3;\n", "not 3 numbers"),
+        ("a b\n", "no numbers after the heading 'a b'"),
     ],
 )
 def test_rows_with_other_contents(tmp_path, text, words):

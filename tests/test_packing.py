@@ -249,7 +249,10 @@ def test_textures_too_small():
         ({"resolution": (1, 2, 3)}, "resolution must be a number of texels, or width and height"),
         ({"tiles": 0}, "tiles must be an integer of at least 1"),
         ({"texels_per_unit": 0}, "texels_per_unit must be positive and finite"),
-        ({"padding": 2000}, r"2 charts with a padding of 2000 texels do not fit into 1024 × 1024 texels: .* suffices"),
+        (
+            {"padding": 2000},
+            r"2 charts with a padding of 2000 texels do not fit into 1024 × 1024 texels: .* suffices for these charts",
+        ),
     ],
 )
 def test_invalid_calls(change, message):

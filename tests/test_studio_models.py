@@ -15,6 +15,7 @@ from quasiharmonic.ui.studio import setup
 from quasiharmonic.ui.studio.setup import make_first_state, unwrap_model
 from quasiharmonic.ui.studio.surface import MAX_TRIANGLES, make_sheet
 from quasiharmonic.ui.studio.validation import RequestError
+from shared.gltf_files import SQUARE, opened, touching_squares
 from shared.pages import Visitor
 
 
@@ -273,6 +274,32 @@ def test_a_large_model_that_must_be_cut_opens_without_a_map(monkeypatch):
     assert one.last("map").header["bijective"]
     one.does("undo")
     assert not one.last("map").header["mapped"]
+
+
+def test_a_gltf_file_keeps_its_materials_and_losses_are_reported(tmp_path):
+    made = touching_squares()
+    made.tree["materials"] = [
+        {"name": str(k), "pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(2)
+    ]
+    made.tree["textures"] = [{"source": 0}, {"source": 0}]
+    made.tree["images"] = [{"bufferView": made.view(io.checkerboard().data), "mimeType": "image/png"}]
+    for k, mesh in enumerate(made.tree["meshes"]):
+        mesh["primitives"][0] |= {"material": k}
+        mesh["primitives"][0]["attributes"]["TEXCOORD_0"] = made.accessor(SQUARE[:, :2] + np.float32(k))
+    path = tmp_path / "two.glb"
+    path.write_bytes(made.glb())
+    one = Visitor(path)
+    for step, unfitting in ("stop", []), ("unwrap", ["the new coordinates"]), ("turn", ["the new coordinates"]):
+        one.does(step)
+        shown = one.does("save", format="glb")
+        (data,) = [frame.arrays["content"].tobytes() for frame in shown if frame.header["kind"] == "file"]
+        tree = opened(data)[0]
+        assert tree["materials"] == made.tree["materials"]
+        assert [mesh["primitives"][0]["material"] for mesh in tree["meshes"]] == [0, 1]
+        notes = [frame.header["text"] for frame in shown if frame.header["kind"] == "note"]
+        assert [note[:19] for note in notes] == unfitting
+    (note,) = [frame.header["text"] for frame in one.does("save", format="ply") if frame.header["kind"] == "note"]
+    assert "map.ply does not have: materials" in note
 
 
 def test_an_image_is_shown_and_saved_with_the_map(tmp_path):

@@ -14,6 +14,7 @@ import pytest
 from quasiharmonic import io
 from quasiharmonic.surfaces import annulus, cat, starfish
 from quasiharmonic.ui.cli import main
+from shared.gltf_files import touching_squares
 from shared.pages import Visitor
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'
@@ -191,6 +192,15 @@ def test_the_command_and_the_script_make_the_map_of_the_page(model, step, opened
     STEPS[step](one)
     shown = one.last("map").header
     assert shown["injective"], shown["verdict"]
+    check_repeated(one, tmp_path, monkeypatch)
+
+
+def test_meshes_of_a_gltf_file_are_not_joined(tmp_path, monkeypatch):
+    path = tmp_path / "model.glb"
+    path.write_bytes(touching_squares().glb())
+    one = Visitor(path)
+    one.does("unwrap", resolution=512)
+    assert one.last("map").header["count"] == 2
     check_repeated(one, tmp_path, monkeypatch)
 
 

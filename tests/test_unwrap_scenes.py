@@ -291,3 +291,13 @@ def test_each_part_has_its_inverse():
             inverse.surface(inverse.locate(middle)), points[triangles[: len(middle)]].mean(axis=1), atol=1e-6
         )
     assert result.parts[1].excluded.tolist() == [len(F)]
+
+
+def test_new_meshes_do_not_replace_others_with_their_names():
+    scene, small, large = trimesh.Scene(), trimesh.creation.box(), trimesh.creation.box((9, 9, 9))
+    scene.add_geometry(small, geom_name="crate", node_name="a")
+    scene.graph.update(frame_to="b", geometry="crate")
+    scene.add_geometry(large, geom_name="crate a", node_name="c")
+    done = unwrap(scene, instances="own", resolution=128).to_scene()
+    extents = {node: done.geometry[done.graph[node][1]].extents.max() for node in "abc"}
+    assert extents == {"a": 1, "b": 1, "c": 9}

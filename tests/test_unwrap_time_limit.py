@@ -62,7 +62,9 @@ def test_time_to_pack_many_charts_is_reserved(monkeypatch):
 def test_charts_of_an_early_end_that_do_not_fit(monkeypatch):
     monkeypatch.setattr(sys.modules["quasiharmonic.apps.unwrapping.stages"], "run_until", lambda left, compute: None)
     loose = np.random.default_rng(0).normal(size=(300, 3))
-    with pytest.raises(ValueError, match=r"ended early: 100 charts .* do not fit .* suffices, or more time"):
+    with pytest.raises(
+        ValueError, match=r"ended early: 100 charts .* do not fit .* suffices for these charts, or more time"
+    ):
         unwrap(loose, np.arange(300).reshape(-1, 3), time_limit=60, resolution=64, padding=16)
 
 

@@ -66,6 +66,15 @@ def square(**attributes):
     return made
 
 
+def touching_squares():
+    """A document with two meshes: squares with a common side."""
+    made = Gltf()
+    for x in range(2):
+        at = made.accessor(SQUARE + np.float32([x, 0, 0]))
+        made.mesh({"attributes": {"POSITION": at}, "indices": made.accessor(HALVES.ravel())})
+    return made
+
+
 def opened(data):
     """The JSON and the buffer of a binary glTF file."""
     size = int.from_bytes(data[12:16], "little")

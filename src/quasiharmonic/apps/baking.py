@@ -135,7 +135,7 @@ class BakeResult(BaseOutcome):
                 "raise max_distance, or check that both models are in the same place."
             )
         if self.problems:
-            text += f" {count_of('problem', 'problems', len(self.problems))}: correct the old model as listed."
+            text += f" {count_of('problem', 'problems', len(self.problems))}: correct the models as listed."
         return text
 
     def summary(self) -> str:

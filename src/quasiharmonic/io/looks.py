@@ -16,10 +16,10 @@ from urllib.parse import quote
 
 import numpy as np
 
-from quasiharmonic.io.errors import MeshFileError
+from quasiharmonic.io.errors import MeshFileError, printable_path
 from quasiharmonic.io.formats.gltf.document import DAMAGE, find_objects
 from quasiharmonic.io.formats.gltf.looks import first_colour_image, gltf_appearance
-from quasiharmonic.io.formats.gltf.reader import CarriedGltf
+from quasiharmonic.io.formats.gltf.reader import CarriedGltf, read_channel
 from quasiharmonic.io.models.appearance import (
     Appearance,
     ImageUse,
@@ -164,19 +164,38 @@ def own_texture(mesh: MeshData) -> Texture | None:
     return None
 
 
-def texture_names(mesh: MeshData) -> list[str]:
+def texture_names(mesh: MeshData, channel: int = 0) -> list[str]:
     """Return the names of the images that the materials of a mesh's file use, in order and without repetition.
 
-    No image is opened.
+    Only images that a channel of texture coordinates places are listed. No image is opened.
     """
     if isinstance(mesh.carried, CarriedGltf):
         try:
-            return list(dict.fromkeys(_names_in_gltf(mesh.carried.document.tree)))
+            return list(dict.fromkeys(_names_in_gltf(mesh.carried.document.tree, channel)))
         except DAMAGE:
             # A damaged description of a material does not prevent other work.
             return []
+    if channel:
+        return []
     textures = (_image_options(words)[1] for words, _ in library_entries(mesh) if _IMAGE_KEYWORD.fullmatch(words[0]))
     return list(dict.fromkeys(PurePosixPath(name).name for name in textures))
+
+
+def unfitting_textures(before: MeshData, after: MeshData) -> list[str]:
+    """Return the names of the file's images that do not fit, because their texture coordinates changed."""
+    if after.texture is not None:
+        return []
+    channel = len(after.lower_maps)
+    old = before.corner_uv if not channel else None
+    if channel and isinstance(before.carried, CarriedGltf):
+        old = read_channel(before.carried, channel)
+    same = old is None or np.array_equal(old, after.corner_uv, equal_nan=True)
+    return [] if same else texture_names(before, channel)
+
+
+def describe_unfitting(names: Sequence[str]) -> str:
+    """Return a sentence on the images that `unfitting_textures` lists."""
+    return f"the new coordinates do not fit the textures of the file: {', '.join(map(printable_path, names))}"
 
 
 def library_entries(mesh: MeshData) -> Iterator[tuple[list[bytes], Path]]:
@@ -195,11 +214,13 @@ def library_entries(mesh: MeshData) -> Iterator[tuple[list[bytes], Path]]:
                     yield words, within
 
 
-def _names_in_gltf(tree: dict[str, Any]) -> Iterator[str]:
-    """Yield the names of the images that the materials of a glTF document show by the first texture coordinates."""
-    for info in find_objects(tree.get("materials", []), lambda node: "index" in node):
+def _names_in_gltf(tree: dict[str, Any], channel: int) -> Iterator[str]:
+    """Yield the names of the images that the materials of meshes show by a channel of texture coordinates."""
+    used = {node["material"] for node in find_objects(tree["meshes"], lambda node: "material" in node)}
+    materials = [material for k, material in enumerate(tree.get("materials", [])) if k in used]
+    for info in find_objects(materials, lambda node: "index" in node):
         moved = info.get("extensions", {}).get("KHR_texture_transform", {})
-        if moved.get("texCoord", info.get("texCoord", 0)) != 0:
+        if moved.get("texCoord", info.get("texCoord", 0)) != channel:
             continue
         texture = tree["textures"][info["index"]]
         # Extensions name images of other formats.

@@ -175,7 +175,9 @@ def _find_channel(mesh: MeshData, channel: int) -> MeshData:
         corners = read_second_places(mesh, carried)
     if corners is None:
         raise MeshFileError(
-            mesh.source, f"has no texture coordinates {channel}", remedy="give a channel of the file; the first is 0"
+            mesh.source,
+            f"has no texture coordinates {channel}",
+            remedy=f"give a channel of the file (the first is 0), or write channel {channel} first",
         )
     return with_corner_map(mesh, corners)
 

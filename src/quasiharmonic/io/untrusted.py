@@ -308,9 +308,9 @@ def read_rows(path: str | os.PathLike[str], columns: int, names: Sequence[bytes]
     numbers and commas are decimal points, as in spreadsheets of many countries. Exponents have an e, or a d as in
     Fortran. A comment starts with ``#``. A first line without numbers is a heading. MeshFileError if the file cannot be
     read, or a line has another count of numbers or anything but finite numbers, or the heading has the ``names`` in
-    another order.
+    another order, or nothing follows it.
     """
-    rows = []
+    rows, heading = list[tuple[int, list[float]]](), b""
     for at, text in content_lines(read_text(path).replace(b'"', b"")):
         if b";" in text:
             words = [word.strip().replace(b",", b".") for word in text.split(b";")]
@@ -320,9 +320,12 @@ def read_rows(path: str | os.PathLike[str], columns: int, names: Sequence[bytes]
             named = [word.lower() for word in words if word.lower() in names]
             if named != sorted(named, key=names.index):
                 raise MeshFileError(path, f"the columns are not in the order {b', '.join(names).decode()}", at)
+            heading = text
             continue
         if len(words) != columns:
             raise MeshFileError(path, f"not {count_of('number', 'numbers', columns)}: {quote_token(text)}", at)
         with report_damage(path, line=at):
             rows.append((at, [number(word) for word in words]))
+    if heading and not rows:
+        raise MeshFileError(path, f"no numbers after the heading {quote_token(heading)}", 1)
     return rows

@@ -134,10 +134,10 @@ def stretch_bound(name: str, value: Any) -> None:
 
 
 def hard_edges(name: str, value: Any) -> None:
-    """Check an angle between two normals in degrees, a list of edges, or None."""
+    """Check an angle between two normals in degrees, a list of edges, ``"file"``, or None."""
     from quasiharmonic.util.arrays import describe
 
-    if value is None or (hasattr(value, "__len__") and not isinstance(value, str)):
+    if value is None or (value == "file" if isinstance(value, str) else hasattr(value, "__len__")):
         return
     if isinstance(value, bool) or not isinstance(value, Real) or not 0 < float(value) <= 180:
         said = repr(value) if isinstance(value, Real | str) else describe(value)

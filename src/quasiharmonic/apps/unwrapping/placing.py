@@ -101,13 +101,15 @@ def place_charts(
     padding = float(wanted.padding)
     if wanted.lightmap:
         return _pack_texel_boxes(charts, size, padding, wanted.rotate, density)
+    if tile is not None:
+        options["rounding"] = _TUNING.rounding
 
     def pack(some: Sequence[Chart], density: float | None) -> Packing:
         # In the model's own unit, so that messages have its density.
         packing = pack_charts(
             [(np.ldexp(chart.uv, exponent), chart.F) for chart in some],
             resolution=size,
-            padding=padding if tile is None else padding + _TUNING.rounding * max(size),
+            padding=padding,
             texels_per_unit=None if density is None else float(np.ldexp(density, -exponent)),
             tiles=wanted.tiles,
             rotate=wanted.rotate,

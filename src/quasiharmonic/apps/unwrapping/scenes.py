@@ -146,6 +146,8 @@ class SceneResult(OutcomeOf):
             else:
                 scene.geometry.pop(part.name, None)
                 name = f"{part.name} {part.node}"
+                while name in scene.geometry:
+                    name += "'"
                 scene.geometry[name] = part.to_trimesh()
                 scene.graph.transforms.node_data[part.node]["geometry"] = name
         return scene

@@ -180,8 +180,9 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     ValueError
         If an array has the wrong shape, a position is not finite, an index is out of range, or no triangle has an area.
         The message names the elements. Also if pairs in ``seams`` or ``no_seams`` are no edges of the mesh, are in both
-        lists, or cannot be kept. If the texture is too small for the padding of all charts, the message states the
-        smallest sufficient resolution, or with ``faces`` a sufficient texel density.
+        lists, or cannot be kept. If the texture is too small for all charts and their padding, the message states a
+        resolution that suffices for these charts, or with ``faces`` a sufficient texel density. With another resolution
+        the charts can differ.
 
     See Also
     --------

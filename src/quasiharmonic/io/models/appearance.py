@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from quasiharmonic.io.atomic import write_whole
+from quasiharmonic.io.errors import printable_path
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.models.textures import MaterialTextures, Texture
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -114,6 +115,10 @@ def plain_appearance(
         opaque = np.ones((len(colours), 1)) if colours.shape[1] == 3 else colours[:, 3:]
         corners = np.concatenate([to_linear(colours[:, :3]), opaque], axis=1)[mesh.F]
     found = [materials.get(names[k] or "", SurfaceMaterial()) for k in used.tolist()]
+    if any(_names_library(line) for line in mesh.statements.split(b"\n")):
+        unknown = dict.fromkeys(name for k in used.tolist() if (name := names[k]) and name not in materials)
+        where = "is in no material library in the folder of the file"
+        problems += tuple(f"material {printable_path(name)} {where}" for name in unknown)
     if corners is not None and (corners[..., 3] < 1).any():
         found = [replace(one, alpha_mode="BLEND") for one in found]
     return Appearance(

@@ -50,6 +50,10 @@ class Carried:
         """Return the number of the mesh (n,) of each vertex; None if the file has one mesh."""
         return None
 
+    def turn_over(self) -> Carried:
+        """Return the contents for the mesh with all faces reversed; by default they do not fit it, and get lost."""
+        return self
+
     def fits(self, mesh: MeshData) -> bool:
         """Return whether a mesh is still the mesh of the file, whatever its map."""
         return np.array_equal(self.V, mesh.V) and np.array_equal(self.F, mesh.F)
@@ -184,7 +188,7 @@ class MeshData:
         return replace(self, vt=mapped.uv, FT=mapped.FT)
 
     def turn_over(self) -> MeshData:
-        """Return the same mesh with all faces reversed, without normals and other data of its file."""
+        """Return the same mesh with all faces reversed, without normals; only glTF files keep their other data."""
         turn = [0, 2, 1]
         return replace(
             self,
@@ -194,7 +198,7 @@ class MeshData:
             FN=None,
             polygons=None if self.polygons is None else self.polygons.turn_over(),
             lower_maps=tuple(places[:, turn] for places in self.lower_maps),
-            carried=None,
+            carried=None if self.carried is None else self.carried.turn_over(),
         )
 
     def as_plane(self, uv: ArrayLike) -> MeshData:

@@ -31,6 +31,7 @@ from quasiharmonic.energies.polishing import polish_result
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.io.errors import FileInUseError
+from quasiharmonic.io.formats.gltf.reader import read_gltf
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.io.untrusted import use_bound
 from quasiharmonic.problem.result import MapResult, Status
@@ -131,7 +132,7 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -
     settings = job["settings"]
     path = records.map_path(folder, settings["map_format"])
     with metadata.time_phase(record, "read"), use_bound(job["record"].get("memory_limit")):
-        mesh = io.read_mesh(job["mesh"])
+        mesh = _read_model(Path(job["mesh"]), settings["unwrap"])
     if settings["unwrap"] is not None:
         _unwrap_model(mesh, settings["unwrap"], path, record, tell)
         return
@@ -160,6 +161,13 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -
         record |= metadata.describe_distortion(*io.without_idle(*io.cut_at_seams(mapped)))
 
 
+def _read_model(path: Path, options: dict[str, Any] | None) -> io.MeshData:
+    """Read a mesh; for a lightmap, each occurrence of a mesh in a glTF file as a mesh of its own."""
+    if options is not None and options.get("lightmap") and path.suffix.lower() in (".glb", ".gltf"):
+        return read_gltf(path, instances="own")
+    return io.read_mesh(path)
+
+
 def _unwrap_model(mesh: io.MeshData, options: dict[str, Any], path: Path, record: Record, tell: Tell) -> None:
     """Unwrap a model with options of `quasiharmonic.unwrap`, write it to ``path``, and record the certified facts."""
     # SciPy's subpackages that this needs would double the time in which workers for maps start.
@@ -169,7 +177,7 @@ def _unwrap_model(mesh: io.MeshData, options: dict[str, Any], path: Path, record
     sizes = {"vertices": len(mesh.V), "triangles": len(mesh.F)}
     tell({"facts": record | sizes})
     with metadata.time_phase(record, "map"):
-        result = unwrap(mesh.V, mesh.F, edge_costs=polygon_costs(mesh), jobs=record.get("threads"), **options)
+        result = unwrap(mesh, edge_costs=polygon_costs(mesh), jobs=record.get("threads"), **options)
     changes = result.cleaned.changes.items()
     stretch = {"stretch": result.stretch.p99, "isometric": result.stretch.worst}
     record |= {

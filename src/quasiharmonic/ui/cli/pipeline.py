@@ -28,18 +28,11 @@ CHECKERBOARD = "checkerboard"
 
 def add_old_textures(facts: dict[str, Any], lines: list[str], before: MeshData, after: MeshData) -> None:
     """Add to a report the names of the file's textures that do not fit because the texture coordinates changed."""
-    import numpy as np
+    from quasiharmonic.io.looks import describe_unfitting, unfitting_textures
 
-    from quasiharmonic import io
-    from quasiharmonic.io.errors import printable_path
-
-    if after.texture is not None or after.lower_maps or not (named := io.texture_names(before)):
-        return
-    if np.array_equal(before.corner_uv, after.corner_uv, equal_nan=True):
-        return
-    facts["old_textures"] = named
-    names = ", ".join(map(printable_path, named))
-    lines.append(f"the new coordinates do not fit the textures of the file: {names}")
+    if named := unfitting_textures(before, after):
+        facts["old_textures"] = named
+        lines.append(describe_unfitting(named))
 
 
 def tell_losses(output: Path, mesh: MeshData) -> None:

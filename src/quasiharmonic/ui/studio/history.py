@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from quasiharmonic import io
+from quasiharmonic.io.formats.gltf.reader import CarriedGltf
+from quasiharmonic.io.looks import describe_unfitting, unfitting_textures
 from quasiharmonic.io.models.textures import Texture
 from quasiharmonic.ui.studio.recipes import MAP, START
 from quasiharmonic.ui.studio.state import SessionState
@@ -166,22 +168,42 @@ def list_files(state: SessionState, form: str, texture: io.Texture | None) -> di
 
     In OBJ, also those that the command and the script read. RequestError if there is no map.
     """
-    if form not in FORMATS:
-        raise RequestError(f"unknown format {form[:20]!r}: use {', '.join(FORMATS)}")
-    mesh = mapped_model(state, None if form == "ply" else texture)
-    files = _write(mesh, MAP if form == "obj" else f"map.{form}")
+    name, mesh = _saved_model(state, form, texture)
+    files = _write(mesh, name)
     if form == "obj":
         recipe = state.recipe
         files |= recipe.texts | ({} if recipe.start is None else _write(recipe.start, START))
     return files
 
 
+def list_losses(state: SessionState, form: str, texture: io.Texture | None) -> list[str]:
+    """Return sentences on what the files of `list_files` lack, and on textures that the map does not fit."""
+    name, mesh = _saved_model(state, form, texture)
+    lost = io.not_held(name, mesh)
+    unfitting = unfitting_textures(state.sheet.mesh, mesh)
+    return [
+        *([describe_unfitting(unfitting)] if unfitting else []),
+        *([f"{name} does not have: {'; '.join(lost)}"] if lost else []),
+    ]
+
+
+def _saved_model(state: SessionState, form: str, texture: io.Texture | None) -> tuple[str, io.MeshData]:
+    """Return the name of the file of a map in a format, and its mesh."""
+    if form not in FORMATS:
+        raise RequestError(f"unknown format {form[:20]!r}: use {', '.join(FORMATS)}")
+    return MAP if form == "obj" else f"map.{form}", mapped_model(state, None if form == "ply" else texture)
+
+
 def mapped_model(state: SessionState, texture: io.Texture | None) -> io.MeshData:
-    """Return the file's mesh with the map of a state and an image; RequestError if there is no map."""
+    """Return the file's mesh with the map of a state and an image; RequestError if there is no map.
+
+    A glTF file keeps its materials, unless the image is another one than its own.
+    """
     if state.mesh.uv is None:
         raise RequestError("there is no map to save yet: press Unwrap or Flatten first")
     mesh = state.sheet.mesh if state.recipe.of_file else state.sheet.mapped_file(state.mesh)
-    return mesh if texture is None else replace(mesh, texture=texture)
+    keeps = isinstance(mesh.carried, CarriedGltf) and texture == state.sheet.texture
+    return mesh if texture is None or keeps else replace(mesh, texture=texture)
 
 
 def write_model(path: Path, mesh: io.MeshData) -> None:

@@ -70,10 +70,10 @@ def unwrap_model(
             raise RequestError("the file's parts are unknown after the mesh has changed: undo, or choose no parts")
         labels = _label_triangles(sheet, which)
         options["labels"] = Given(labels, public(statement_labels)(_MODEL, *PARTS[which]), {"labels": which})
-    V, F = (sheet.mesh.V, sheet.mesh.F) if from_file else (mesh.V, mesh.F)
-    result = unwrap(V, F, callback=callback, **recipes.values(options))
-    used = np.unique(F)
-    if from_file and sheet.is_file and len(np.unique(V[used], axis=0)) < len(used):
+    model = sheet.mesh if from_file else mesh
+    result = unwrap(model, callback=callback, **recipes.values(options))
+    used = np.unique(model.F)
+    if from_file and sheet.is_file and (result.cleaned.representatives[used] != used).any():
         # Charts reach across vertices at equal positions, so these become one.
         sheet = sheet.clean_up()
         state = replace(state, sheet=sheet, forbidden=sheet.find_edges(state.forbidden))
@@ -113,7 +113,7 @@ def _record_unwrap(source: Source, options: dict[str, Any]) -> Recipe:
     """Return the recipe of a call of `unwrap` on a file."""
     script = Script()
     script.let("model", public(read_mesh)(source.name))
-    code = script.let("result", public(unwrap)(_MODEL.V, _MODEL.F, **options))
+    code = script.let("result", public(unwrap)(_MODEL, **options))
     script.let("mesh", public(SeamedMesh)(_MODEL.V, _MODEL.F, code.indices, code.uvs))
     return recipes.record_call("unwrap", source, "unwrapped.obj", options, script)
 
@@ -132,6 +132,8 @@ def _unwrap_rest(state: SessionState, callback: Callback, options: dict[str, Any
         options[name] = edit.value[are_sides(edit.value, F, len(surface.V))]
     if sheet.is_file and (costs := polygon_costs(sheet.mesh)) is not None:
         options["edge_costs"] = costs[sheet.unmapped]
+    if sheet.is_file:
+        options["meshes"] = sheet.meshes
     result = unwrap(surface.V, F, callback=callback, **options)
     right = np.ceil(uv[np.delete(FT, sheet.unmapped, axis=0), 0].max())
     FT[sheet.unmapped] = result.indices + len(uv)

@@ -51,6 +51,11 @@ class PageSurface:
         """Whether the surface has the vertices and triangles of the file."""
         return self.cleaned is None and not self.turned
 
+    @property
+    def meshes(self) -> IntArray | None:
+        """Number of the mesh of each vertex of the model; None if the file has one mesh."""
+        return None if self.mesh.carried is None else self.mesh.carried.number_meshes()
+
     @cached_property
     def inward(self) -> int:
         """Number of closed components that are inside out."""
@@ -106,7 +111,7 @@ class PageSurface:
 
     def clean_up(self) -> PageSurface:
         """Return the model as read, with a cleaned surface, in which vertices at equal positions are one."""
-        cleaned = clean(self.mesh.V, self.mesh.F)
+        cleaned = clean(self.mesh.V, self.mesh.F, meshes=self.meshes)
         surface = io.MeshData(cleaned.V, cleaned.F, source=self.mesh.source)
         return replace(self, surface=surface, cleaned=cleaned, turned=False, fixed=None)
 

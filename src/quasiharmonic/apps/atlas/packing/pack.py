@@ -119,6 +119,7 @@ def pack_charts(
     kinds: Sequence[int] | None = None,
     closely: int = BITMAPS,
     occupied: tuple[ArrayLike, ArrayLike] | None = None,
+    rounding: float = 2.0**-22,
 ) -> Packing:
     """Pack charts into one or several textures by their shapes, as large as possible and at one texel density.
 
@@ -147,6 +148,8 @@ def pack_charts(
         Number of charts that are placed by their shapes; all others are placed as boxes, which is faster.
     occupied : (uv, F), optional
         Texture coordinates (m, 2) and triangles (k, 3) of charts that stay. The others keep the padding to them.
+    rounding : float
+        Additional space between charts for rounding to single precision, relative to the texture's side.
 
     Returns
     -------
@@ -171,8 +174,6 @@ def pack_charts(
     >>> len(packing.placements), bool(packing.utilisation > 0.3)
     (2, True)
     """
-    # Additional space between charts, relative to the texture's side, for rounding to single precision.
-    rounding = 2.0**-22
     pairs = _check_charts(charts)
     size = check_texture(resolution, padding, texels_per_unit, tiles, rotate, stack)
     check_integer("closely", closely, minimum=0)
@@ -222,9 +223,8 @@ def pack_charts(
                 f"use less padding{'' if texels_per_unit is None else ', or fewer texels per unit'}"
             )
         sufficient = f"{width} × {height} texels" if width != height else f"resolution={width}"
-        raise ValueError(
-            f"{no_fit} {f'{tiles} tiles of ' if tiles > 1 else ''}{size[0]} × {size[1]} texels: {sufficient} suffices"
-        )
+        into_all = f"{f'{tiles} tiles of ' if tiles > 1 else ''}{size[0]} × {size[1]} texels"
+        raise ValueError(f"{no_fit} {into_all}: {sufficient} suffices for these charts")
     placed = {i: _place(shape, layout, k) for k, (i, shape) in enumerate(zip(originals, shapes, strict=True))}
     for i, copy in copies.items():
         placed[i] = _place_copy(copy.motion, placed[copy.original], layout.scale)

@@ -84,7 +84,8 @@ class Primitive:
 class CarriedGltf(Carried):
     """A glTF document, the folder of its image files, and the relation of the surface to its primitives.
 
-    ``rows`` (f, 3) has for every corner its vertex among those of all pools.
+    ``rows`` (f, 3) has for every corner its vertex among those of all pools. ``turned`` tells whether the triangles are
+    those of the document reversed.
     """
 
     document: Document
@@ -92,6 +93,10 @@ class CarriedGltf(Carried):
     pools: list[VertexPool]
     parts: list[Primitive]
     rows: IntArray
+    turned: bool = False
+
+    def turn_over(self) -> CarriedGltf:
+        return replace(self, F=self.F[:, (0, 2, 1)], rows=self.rows[:, (0, 2, 1)], turned=not self.turned)
 
     @cached_property
     def parts_of(self) -> list[list[Primitive]]:

@@ -101,8 +101,8 @@ def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:
         if name in pool.attributes:
             old = document.reals(pool.attributes[name])[origin]
             table = np.where(corner[:, None] < 0, old.astype(np.float32), table)
-        if len(origin) > pool.count:
-            _extend(document, pool, primitives, origin, users, name)
+        if carried.turned or len(origin) > pool.count:
+            _extend(document, pool, primitives, origin, users, name, carried.turned)
             bounds = np.cumsum([part.end - part.begin for part in parts])[:-1]
             for primitive, own in zip(primitives, np.split(rows, bounds), strict=True):
                 primitive["mode"] = 4
@@ -192,15 +192,18 @@ def _extend(
     origin: IntArray,
     users: Counter[int],
     changed: str,
+    turned: bool,
 ) -> None:
-    """Copy the attributes of a pool's vertices, except the changed one, to their copies."""
+    """Copy the attributes of a pool's vertices, except the changed one, to their copies; reverse normals if turned."""
     attributes = [(name, accessor) for name, accessor in pool.attributes.items() if name != changed]
     shared = [([primitive["attributes"] for primitive in primitives], attributes)]
     for t, target in enumerate(pool.targets):
         shared.append(([primitive["targets"][t] for primitive in primitives], list(target.items())))
     for holders, entries in shared:
         for name, accessor in entries:
-            _set_numbers(document, holders, name, document.numbers(accessor)[origin], users, repeated=True)
+            table = document.numbers(accessor)[origin]
+            table = -table if turned and name == "NORMAL" else table
+            _set_numbers(document, holders, name, table, users, repeated=True)
 
 
 def _set_numbers(

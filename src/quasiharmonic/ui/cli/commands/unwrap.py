@@ -160,13 +160,7 @@ def _read(options: argparse.Namespace, source: Path) -> MeshData:
 def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeline.Changed:
     """Unwrap a mesh."""
     from quasiharmonic import io
-    from quasiharmonic.apps.unwrapping.model_files import (
-        add_map,
-        corner_positions,
-        find_hard_edges,
-        is_written,
-        material_densities,
-    )
+    from quasiharmonic.apps.unwrapping.model_files import add_map, corner_positions, is_written, material_densities
     from quasiharmonic.apps.unwrapping.unwrap import unwrap
     from quasiharmonic.io.errors import printable_path
     from quasiharmonic.util.arrays import count_of
@@ -179,12 +173,10 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
     keeps = options.keep_seams or options.faces is not None
     with pipeline.show_work(options.input, _words) as show:
         result = unwrap(
-            mesh.V,
-            mesh.F,
+            mesh,
             rotate=not options.no_rotate,
             edge_costs=_edge_costs(mesh, options.edge_costs),
-            hard_edges=find_hard_edges(mesh) if options.hard_edges == "file" else options.hard_edges,
-            meshes=None if mesh.carried is None else mesh.carried.number_meshes(),
+            hard_edges=options.hard_edges,
             tile_by=None if options.tile_by is None else _labels(mesh, "materials", "--tile-by"),
             seams=_read_integers(options.seams, 2),
             no_seams=_read_integers(options.no_seams, 2),
