@@ -268,3 +268,26 @@ def test_a_mesh_that_overlaps_itself_says_so():
     result = morph(points, F, edge, np.stack([radius * np.sin(angle), -radius * np.cos(angle)], axis=1))
     assert result.success
     assert "overlaps itself" in result.summary()
+
+
+def test_the_message_says_what_ended_the_search_early():
+    points, F = surfaces.grid(8, 8)
+    moved, positions = dented(points, 0.9)
+    assert not morph(points, F, moved, positions, energy=None, max_iterations=1).valid
+    for energy, limit, valid, status in (
+        (None, 1, False, Status.OUT_OF_ITERATIONS),
+        (None, 2000, False, Status.INTERRUPTED),
+        ("mips", 2000, True, Status.INTERRUPTED),
+    ):
+        calls = []
+
+        def stop(step, calls=calls, valid=valid):
+            calls.append(step)
+            if step.inverted == 0 if valid else len(calls) == 3:
+                raise KeyboardInterrupt
+
+        callback = stop if status is Status.INTERRUPTED else None
+        result = morph(points, F, moved, positions, energy=energy, max_iterations=limit, callback=callback)
+        assert (result.valid, result.success, result.status) == (valid, False, status)
+        assert result.message == status.value
+        assert "Move the boundary less" not in result.summary()
