@@ -50,6 +50,18 @@ def test_a_deep_dent_stays_valid_where_springs_invert_triangles():
     assert json.loads(json.dumps(morphed.to_dict()))["quality_after"]["minimum"] > 0
 
 
+@pytest.mark.slow
+def test_more_iterations_lower_the_energy_further():
+    """The hole of a square almost touches the outer side."""
+    points, F = surfaces.annulus(6)
+    body = np.flatnonzero(np.abs(points).max(axis=1) <= np.abs(points).max(axis=1).min())
+    first = morph(points, F, body, points[body] + [0.4999, 0])
+    assert first.status is Status.STILL_FALLING
+    longer = morph(points, F, body, points[body] + [0.4999, 0], max_iterations=10_000)
+    assert longer.status is Status.POLISHED
+    assert longer.n_iterations > 2 * first.n_iterations
+
+
 def test_without_moved_vertices_nothing_changes():
     points, F = surfaces.random_delaunay(200, seed=2)
     kept = points.copy()

@@ -215,10 +215,16 @@ def polish_result(
     return replace(further, refined=result.refined, refinement_attempts=result.refinement_attempts)
 
 
+def limit_polish(max_iterations: int) -> int:
+    """Return the maximum number of steps of the polish that follows a search with at most ``max_iterations``."""
+    return max(200, max_iterations // 10)
+
+
 def polish_options(options: MapOptions) -> PolishOptions:
     """Return the options of the polish that follows a search, with the energy that they name."""
     return PolishOptions(
         energy=find_energy(options.polish),
+        max_iterations=limit_polish(options.max_iterations),
         linear_solver=options.linear_solver,
         callback=options.callback,
         slide=options.slide,

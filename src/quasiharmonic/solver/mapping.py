@@ -80,7 +80,8 @@ def injective_map(
         ``"speed"`` finds a map fastest; ``"paper"`` is the pipeline of the paper, with si-log first. A sequence gives
         the stages directly.
     polish : str or Energy, optional
-        Distortion energy to lower after an injective map is found; see `quasiharmonic.polish` for the names.
+        Distortion energy to lower after an injective map is found; see `quasiharmonic.polish` for the names. A tenth of
+        ``max_iterations`` limits the Newton steps, but at least 200 are allowed.
     start : (n, 2) array, optional
         Initial map, for instance the map of the same mesh for a similar target. The search starts from its tensors. If
         that fails, later stages start from scratch.

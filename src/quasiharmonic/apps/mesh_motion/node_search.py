@@ -16,7 +16,7 @@ from quasiharmonic.apps.mesh_motion.midsides import centre_midsides, restore_mid
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.sliding_boundary import move_onto
-from quasiharmonic.energies.polishing import polish_result
+from quasiharmonic.energies.polishing import limit_polish, polish_result
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
@@ -120,7 +120,12 @@ class NodeSearch:
             result = make_convex(problem, result, corners, linear_solver=linear_solver)
         if energy is not None and not inverted_triangles(own if corners is None else corners, result.uv).size:
             polishing = PolishOptions(
-                energy=energy, tol=self.options.tol, linear_solver=linear_solver, callback=callback, slide=curves
+                energy=energy,
+                max_iterations=limit_polish(iterations),
+                tol=self.options.tol,
+                linear_solver=linear_solver,
+                callback=callback,
+                slide=curves,
             )
             result = polish_result(problem, result, polishing, triangles=corners)
         after = points.copy()
