@@ -96,7 +96,8 @@ def injective_map(
         with the last `Step` again at least every half second, but not within a single factorisation. It may raise
         `KeyboardInterrupt`, for instance after a time limit, which ends the search as Ctrl-C does.
     record_every : int
-        Keep every ``record_every``-th map in the result's ``path``. Default: 0, keep no maps.
+        Keep every ``record_every``-th map in the result's ``path``. Default: 0, keep no maps. If edges are split, only
+        maps of the given mesh are kept.
     time_limit : float, optional
         Seconds after which the call returns the best map so far with status ``TIME_LIMIT``. It is checked as often as
         the callback is called. The result then depends on the speed of the machine.
