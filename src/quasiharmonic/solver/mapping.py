@@ -105,11 +105,12 @@ def injective_map(
         Let boundary vertices slide along their outline during polishing, with fixed corners; see
         `quasiharmonic.polish`. If the boundary of ``target`` is off the curves by a chord, it is moved onto them first.
     refine : bool
-        If the given mesh has no injective map, split as few interior edges as possible. The edges are those that the
-        diagnosis names, then edges around inverted triangles, then those that a construction with a proof needs. The
-        construction requires a connected surface without handles. The target's loops must be simple, disjoint, nested
-        and wound as the mesh's; pins must be distinct and strictly inside. The result is then a bijective map or has
-        status ``PRECISION_LIMIT``. With dozens of pins far from their mesh positions it may be ``TOO_MANY_SPLITS``.
+        If a shortened search finds no injective map of the given mesh, split as few interior edges as possible. A
+        search without ``refine`` may take longer and still find a map. The edges are those that the diagnosis names,
+        then edges around inverted triangles, then those that a construction with a proof needs. The construction
+        requires a connected surface without handles. The target's loops must be simple, disjoint, nested and wound as
+        the mesh's; pins must be distinct and strictly inside. The result is then a bijective map or has status
+        ``PRECISION_LIMIT``. With dozens of pins far from their mesh positions it may be ``TOO_MANY_SPLITS``.
 
     Returns
     -------

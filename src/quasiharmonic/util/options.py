@@ -258,7 +258,7 @@ class MapOptions(SolverOptions):
     time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     slide: Any = option(False)
     refine: bool = option(
-        False, "if no map exists, split as few inner edges as necessary (adds vertices at the end)", check=switch
+        False, "if no map is found soon, split as few inner edges as necessary (adds vertices at the end)", check=switch
     )
 
 
