@@ -50,6 +50,18 @@ def test_a_deep_dent_stays_valid_where_springs_invert_triangles():
     assert json.loads(json.dumps(morphed.to_dict()))["quality_after"]["minimum"] > 0
 
 
+@pytest.mark.slow
+def test_more_iterations_lower_the_energy_further():
+    """The hole of a square almost touches the outer side."""
+    points, F = surfaces.annulus(6)
+    body = np.flatnonzero(np.abs(points).max(axis=1) <= np.abs(points).max(axis=1).min())
+    first = morph(points, F, body, points[body] + [0.4999, 0])
+    assert first.status is Status.STILL_FALLING
+    longer = morph(points, F, body, points[body] + [0.4999, 0], max_iterations=10_000)
+    assert longer.status is Status.POLISHED
+    assert longer.n_iterations > 2 * first.n_iterations
+
+
 def test_without_moved_vertices_nothing_changes():
     points, F = surfaces.random_delaunay(200, seed=2)
     kept = points.copy()
@@ -268,3 +280,26 @@ def test_a_mesh_that_overlaps_itself_says_so():
     result = morph(points, F, edge, np.stack([radius * np.sin(angle), -radius * np.cos(angle)], axis=1))
     assert result.success
     assert "overlaps itself" in result.summary()
+
+
+def test_the_message_says_what_ended_the_search_early():
+    points, F = surfaces.grid(8, 8)
+    moved, positions = dented(points, 0.9)
+    assert not morph(points, F, moved, positions, energy=None, max_iterations=1).valid
+    for energy, limit, valid, status in (
+        (None, 1, False, Status.OUT_OF_ITERATIONS),
+        (None, 2000, False, Status.INTERRUPTED),
+        ("mips", 2000, True, Status.INTERRUPTED),
+    ):
+        calls = []
+
+        def stop(step, calls=calls, valid=valid):
+            calls.append(step)
+            if step.inverted == 0 if valid else len(calls) == 3:
+                raise KeyboardInterrupt
+
+        callback = stop if status is Status.INTERRUPTED else None
+        result = morph(points, F, moved, positions, energy=energy, max_iterations=limit, callback=callback)
+        assert (result.valid, result.success, result.status) == (valid, False, status)
+        assert result.message == status.value
+        assert "Move the boundary less" not in result.summary()

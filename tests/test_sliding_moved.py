@@ -9,6 +9,7 @@ import pytest
 
 from quasiharmonic import (
     BoundaryCurves,
+    Status,
     boundary_loops,
     certify,
     distortion,
@@ -57,6 +58,21 @@ def test_elements_of_four_and_six_nodes_make_way_for_a_piston():
         moved = morph(points, F, piston, points[piston] - [0, 0.6 * np.ptp(points[:, 1])], slide=True)
         assert moved.success
         np.testing.assert_array_equal(np.abs(moved.points[:, 0]).max(), np.abs(points[:, 0]).max())
+
+
+@pytest.mark.parametrize("height", [-0.1, 0.0])
+def test_walls_that_a_piston_has_left_do_not_slide(height):
+    """The moved boundary crosses or touches itself, so it is no curve."""
+    places, squares = quadrilaterals(4, 4)
+    curved, six = second_order(*surfaces.grid(3, 3))
+    for points, F in (surfaces.grid(4, 4), (places, squares), (curved, six)):
+        low, high = points[:, 1].min(), points[:, 1].max()
+        piston = np.flatnonzero(points[:, 1] == high)
+        target = np.column_stack([points[piston, 0], np.full(piston.size, low + height)])
+        for slide in (False, True):
+            moved = morph(points, F, piston, target, slide=slide)
+            assert moved.status is Status.IMPOSSIBLE
+            np.testing.assert_array_equal(moved.points[piston], target)
 
 
 def test_nodes_of_a_circle_make_way_along_it():

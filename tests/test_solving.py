@@ -41,6 +41,13 @@ class TestFinds:
         assert result.certificate.bijective
         assert inverted(F, result.uv) == 0
 
+    def test_a_found_map_has_no_diagnosis(self):
+        """The search examines obstructions before its second stage."""
+        result = injective_map(*turned_ring(90), strategy=[VectorAdam(iterations=1), VectorAdam()])
+        assert len(result.stages) == 2
+        assert result.success
+        assert result.diagnosis is None
+
     def test_two_pins_swapped(self):
         """Figure 17, without a given parameterisation."""
         V, F = grid(20, 20)

@@ -60,6 +60,7 @@ class PolishKeywords(TypedDict, total=False):
     tol: float
     linear_solver: str
     callback: Callable[[Step], object] | None
+    record_every: int
     time_limit: float | None
     slide: bool | BoundaryCurves
 
@@ -107,6 +108,8 @@ def polish(
     callback : callable, optional
         Called with a `Step` at the start and after every step; ``Step.energy`` is the mean energy. Between steps it is
         called with the last `Step` again at least every half second, but not during a single factorisation.
+    record_every : int
+        Keep every ``record_every``-th map in the result's ``path``. Default: 0, keep no maps.
     time_limit : float, optional
         Seconds after which the call returns the best map so far with status ``TIME_LIMIT``. It is checked as often as
         the callback is called. The result then depends on the speed of the machine.
@@ -178,7 +181,7 @@ def polish_map(
 def _polish(domain: Domain, uv: ArrayLike, options: PolishOptions, triangles: IntArray | None) -> MapResult:
     """Polish a map; see `polish_map`."""
     chosen, linear_solver = find_energy(options.energy), options.linear_solver
-    run = Run(options.callback)
+    run = Run(options.callback, options.record_every)
     start = check_injective(domain, uv, "polish needs an injective map: repair it first (repair; qhm repair)")
     track = None if options.slide is False else move_boundary(options.slide, domain, start)
     if track is not None:
@@ -200,7 +203,12 @@ def _polish(domain: Domain, uv: ArrayLike, options: PolishOptions, triangles: In
     name = options.energy if isinstance(options.energy, str) else type(chosen).__name__
     status = Status.INTERRUPTED
     with run.until_interrupted():
-        status = run.descend(f"polish, {name}", outcomes, lambda: model.mean_energy(descent.state))
+        status = run.descend(
+            f"polish, {name}",
+            outcomes,
+            lambda: model.mean_energy(descent.state),
+            lambda: model.positions(descent.w),
+        )
     run.judge_last_stage(kept=descent.value < descent.first)
     uv = model.positions(descent.w)
     solver = model.system.solver.name
@@ -210,17 +218,28 @@ def _polish(domain: Domain, uv: ArrayLike, options: PolishOptions, triangles: In
 def polish_result(
     problem: Problem, result: MapResult, options: PolishOptions, *, triangles: IntArray | None = None
 ) -> MapResult:
-    """Polish the injective map of a result with `polish_map`, appending to its stages and history."""
+    """Polish the injective map of a result with `polish_map`, appending to its stages, history and path.
+
+    If edges were split, the path has only maps of the given mesh.
+    """
+    options = replace(options, record_every=0) if result.refined is not None else options
     further = polish_map(problem.domain, result.uv, options, triangles=triangles).after(result)
     return replace(further, refined=result.refined, refinement_attempts=result.refinement_attempts)
+
+
+def limit_polish(max_iterations: int) -> int:
+    """Return the maximum number of steps of the polish that follows a search with at most ``max_iterations``."""
+    return max(200, max_iterations // 10)
 
 
 def polish_options(options: MapOptions) -> PolishOptions:
     """Return the options of the polish that follows a search, with the energy that they name."""
     return PolishOptions(
         energy=find_energy(options.polish, "polish"),
+        max_iterations=limit_polish(options.max_iterations),
         linear_solver=options.linear_solver,
         callback=options.callback,
+        record_every=options.record_every,
         slide=options.slide,
     )
 

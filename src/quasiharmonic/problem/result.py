@@ -420,11 +420,12 @@ class MapResult(ReadOnly, Displayable, Outcome):
 
     def after(self, earlier: MapResult) -> MapResult:
         """Return this result with the stages, history, path and time of an earlier call before its own."""
+        shift = len(earlier.history) - (self.history[0].iteration if self.history else 0)
         return replace(
             self,
             stages=earlier.stages + self.stages,
             history=earlier.history + self.history,
-            path=earlier.path + self.path,
+            path=earlier.path + [Snapshot(one.iteration + shift, one.uv) for one in self.path],
             seconds=earlier.seconds + self.seconds,
         )
 

@@ -80,7 +80,8 @@ def injective_map(
         ``"speed"`` finds a map fastest; ``"paper"`` is the pipeline of the paper, with si-log first. A sequence gives
         the stages directly.
     polish : str or Energy, optional
-        Distortion energy to lower after an injective map is found; see `quasiharmonic.polish` for the names.
+        Distortion energy to lower after an injective map is found; see `quasiharmonic.polish` for the names. A tenth of
+        ``max_iterations`` limits the Newton steps, but at least 200 are allowed.
     start : (n, 2) array, optional
         Initial map, for instance the map of the same mesh for a similar target. The search starts from its tensors. If
         that fails, later stages start from scratch.
@@ -95,7 +96,8 @@ def injective_map(
         with the last `Step` again at least every half second, but not within a single factorisation. It may raise
         `KeyboardInterrupt`, for instance after a time limit, which ends the search as Ctrl-C does.
     record_every : int
-        Keep every ``record_every``-th map in the result's ``path``. Default: 0, keep no maps.
+        Keep every ``record_every``-th map in the result's ``path``. Default: 0, keep no maps. If edges are split, only
+        maps of the given mesh are kept.
     time_limit : float, optional
         Seconds after which the call returns the best map so far with status ``TIME_LIMIT``. It is checked as often as
         the callback is called. The result then depends on the speed of the machine.
@@ -103,11 +105,12 @@ def injective_map(
         Let boundary vertices slide along their outline during polishing, with fixed corners; see
         `quasiharmonic.polish`. If the boundary of ``target`` is off the curves by a chord, it is moved onto them first.
     refine : bool
-        If the given mesh has no injective map, split as few interior edges as possible. The edges are those that the
-        diagnosis names, then edges around inverted triangles, then those that a construction with a proof needs. The
-        construction requires a connected surface without handles. The target's loops must be simple, disjoint, nested
-        and wound as the mesh's; pins must be distinct and strictly inside. The result is then a bijective map or has
-        status ``PRECISION_LIMIT``. With dozens of pins far from their mesh positions it may be ``TOO_MANY_SPLITS``.
+        If a shortened search finds no injective map of the given mesh, split as few interior edges as possible. A
+        search without ``refine`` may take longer and still find a map. The edges are those that the diagnosis names,
+        then edges around inverted triangles, then those that a construction with a proof needs. The construction
+        requires a connected surface without handles. The target's loops must be simple, disjoint, nested and wound as
+        the mesh's; pins must be distinct and strictly inside. The result is then a bijective map or has status
+        ``PRECISION_LIMIT``. With dozens of pins far from their mesh positions it may be ``TOO_MANY_SPLITS``.
 
     Returns
     -------

@@ -275,7 +275,7 @@ class _Refinement:
         best = self._best
         if best.stages and best.stages[-1].name == CONSTRUCTED:
             best = self._use_construction(best)
-        best = replace(best, stages=self._last.stages, history=self._last.history)
+        best = replace(best, stages=self._last.stages, history=self._last.history, path=self._last.path)
         return replace(best, status=Status.INTERRUPTED, refinement_attempts=self._attempts)
 
     def _run_attempts(self, start: FloatArray | None, budget: int) -> MapResult:
@@ -405,10 +405,10 @@ class _Refinement:
         )
 
     def _append(self, result: MapResult) -> MapResult:
-        """Prepend the stages and history of earlier attempts to a result, and store it as the latest."""
+        """Prepend the stages, history and path of earlier attempts to a result, and store it as the latest."""
         last, best = self._last, self._best
         if last is not None:
-            result = replace(result, stages=last.stages + result.stages, history=last.history + result.history)
+            result = result.after(last)
         self._last = result
         if best is None or _rank(result) <= _rank(best):
             self._best = result

@@ -258,7 +258,7 @@ class MapOptions(SolverOptions):
     time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     slide: Any = option(False)
     refine: bool = option(
-        False, "if no map exists, split as few inner edges as necessary (adds vertices at the end)", check=switch
+        False, "if no map is found soon, split as few inner edges as necessary (adds vertices at the end)", check=switch
     )
 
 
@@ -306,6 +306,7 @@ class PolishOptions(SolverOptions):
     weights: Any = option(None)
     max_iterations: int = option(200, "maximum number of Newton steps (default: 200)", check=count)
     tol: float = option(1e-4, check=tolerance)
+    record_every: int = option(0, check=count)
     time_limit: float | None = option(None, _TIME_LIMIT, check=seconds)
     slide: Any = option(False)
 

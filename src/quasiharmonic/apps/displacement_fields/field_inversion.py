@@ -35,7 +35,46 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class InverseVolume:
+class InverseField:
+    """The inverse of a displacement field.
+
+    Attributes
+    ----------
+    field : (h, w, 2) float64
+        Displacement from the pixel at position q to its source ``q + field``; NaN for pixels without a source.
+    outside : (h, w) bool
+        Pixels outside the image of the given field, which have no source.
+    error : float
+        Maximum distance of a pixel from itself after the inverse and the given field, in the field's unit; caused by
+        rounding only.
+
+    See Also
+    --------
+    inverse_field : Makes it.
+    results.InverseVolume : The inverse on voxels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from quasiharmonic import inverse_field
+    >>> back = inverse_field(np.full((4, 4, 2), 1.0))
+    >>> back.field[2, 2].tolist(), bool(back.outside[0, 0])
+    ([-1.0, -1.0], True)
+    """
+
+    field: FloatArray
+    outside: BoolArray
+    error: float
+
+    def summary(self) -> str:
+        """Describe the inverse in one sentence."""
+        points = "voxels" if self.field.ndim == 4 else "pixels"
+        share = f"{100 * float(self.outside.mean()):.3g} % of the {points} lie outside"
+        return f"{share}; for the others, the round-trip error is at most {self.error:.2g}"
+
+
+@dataclass(frozen=True, eq=False)
+class InverseVolume(InverseField):
     """The inverse of a displacement field on voxels.
 
     Attributes
@@ -44,6 +83,9 @@ class InverseVolume:
         Displacement from the voxel at position q to its source ``q + field``; NaN for voxels without a source.
     outside : (d, h, w) bool
         Voxels outside the image of the given field.
+    error : float
+        Maximum distance of a voxel from itself after the inverse and the given field, in the field's unit; caused by
+        rounding only.
 
     See Also
     --------
@@ -59,13 +101,6 @@ class InverseVolume:
     ([-1.0, -1.0, -1.0], True)
     """
 
-    field: FloatArray
-    outside: BoolArray
-
-    def summary(self) -> str:
-        """Describe the inverse in one sentence."""
-        return f"{100 * float(self.outside.mean()):.3g} % of the voxels lie outside"
-
 
 def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
     """`quasiharmonic.inverse_field` for fields on voxels (d, h, w, 3), affine on the tetrahedra of each cell."""
@@ -76,12 +111,11 @@ def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
             "the field has no inverse: the surface of the grid crosses itself; change the displacements there"
         )
     back = np.full((int(np.prod(grid.shape)), 3), np.nan)
-    best = np.full(len(back), -np.inf)
+    best, away = np.full(len(back), -np.inf), np.zeros(back.shape)
     X = (grid.positions(given) / grid.spacing).reshape(-1, 3)
     for tetrahedra, voxel, position in _candidates(grid, X):
         p = X[tetrahedra]
-        weights = _solve_each(np.moveaxis(p[:, 1:] - p[:, :1], 1, 2), position - p[:, 0])
-        weights = np.column_stack([1 - weights.sum(axis=1), weights])
+        weights = _find_weights(p, position)
         inside = weights.min(axis=1)
         good = np.flatnonzero(inside >= -_ROUNDING)
         # If a voxel occurs several times, the last assignment, of the tetrahedron that it is deepest inside, holds.
@@ -90,9 +124,18 @@ def inverse_volume(field: ArrayLike, spacing: ArrayLike) -> InverseVolume:
         source = np.stack(np.unravel_index(tetrahedra[good], grid.shape), axis=-1)[..., ::-1]
         best[voxel[good]] = inside[good]
         back[voxel[good]] = (weights[good][..., None] * source).sum(axis=1) - position[good]
+        weights = _find_weights(source, position[good] + back[voxel[good]])
+        away[voxel[good]] = (weights[..., None] * p[good]).sum(axis=1) - position[good]
     back = np.ldexp(back * grid.spacing, exponent)
     outside = np.isnan(back[:, 0])
-    return InverseVolume(back.reshape(given.shape), outside.reshape(grid.shape))
+    error = float(np.ldexp(np.linalg.norm(away * grid.spacing, axis=1).max(), exponent))
+    return InverseVolume(back.reshape(given.shape), outside.reshape(grid.shape), error)
+
+
+def _find_weights(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the barycentric coordinates (k, 4) of points (k, 3) in tetrahedra with corners (k, 4, 3)."""
+    weights = _solve_each(np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 2), points - corners[:, 0])
+    return np.column_stack([1 - weights.sum(axis=1), weights])
 
 
 def _solve_each(A: FloatArray, b: FloatArray) -> FloatArray:
@@ -130,46 +173,6 @@ def _candidates(grid: VoxelGrid, X: FloatArray) -> Iterator[tuple[IntArray, IntA
         place = low[of] + np.stack([x, y, z], axis=1)
         voxel = np.asarray(np.ravel_multi_index(tuple(place.T[::-1]), grid.shape))
         yield T[of], voxel, place.astype(np.float64)
-
-
-@dataclass(frozen=True, eq=False)
-class InverseField:
-    """The inverse of a displacement field.
-
-    Attributes
-    ----------
-    field : (h, w, 2) float64
-        Displacement from the pixel at position q to its source ``q + field``; NaN for pixels without a source.
-    outside : (h, w) bool
-        Pixels outside the image of the given field, which have no source.
-    error : float
-        Maximum distance of a pixel from itself after the inverse and the given field, in the field's unit; caused by
-        rounding only.
-
-    See Also
-    --------
-    inverse_field : Makes it.
-    results.InverseVolume : The inverse on voxels.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from quasiharmonic import inverse_field
-    >>> back = inverse_field(np.full((4, 4, 2), 1.0))
-    >>> back.field[2, 2].tolist(), bool(back.outside[0, 0])
-    ([-1.0, -1.0], True)
-    """
-
-    field: FloatArray
-    outside: BoolArray
-    error: float
-
-    def summary(self) -> str:
-        """Describe the inverse in one sentence."""
-        share = 100 * float(self.outside.mean())
-        return (
-            f"{share:.3g} % of the pixels lie outside; for the others, the round-trip error is at most {self.error:.2g}"
-        )
 
 
 def inverse_field(field: ArrayLike, *, spacing: ArrayLike = 1.0) -> InverseField | InverseVolume:

@@ -11,7 +11,7 @@ import numpy as np
 from quasiharmonic.apps.tetrahedra.result import describe_qualities, summarise_qualities
 from quasiharmonic.geometry.exact.predicates import orientation
 from quasiharmonic.geometry.mesh.elements import corner_triangles, jacobian_coefficients, name_elements
-from quasiharmonic.problem.result import MapResult
+from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.outcome import Displayable, OutcomeOf, SummarisedOutcome, as_plain
 
@@ -96,24 +96,26 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
     def summary(self) -> str:
         """Return a text that says whether the mesh is valid, and otherwise what is wrong."""
         qualities = self.describe_quality()
+        ended_early = self.status in (Status.INTERRUPTED, Status.OUT_OF_ITERATIONS)
+        lines = [self.status.value] if ended_early else []
         if self.valid:
-            sound = f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.\n{qualities}"
-            if self.result.certificate.bijective:
-                return sound
-            if self.F.shape[1] == 6:
-                return f"{sound}\nThe straight triangles between the nodes overlap, so the mesh may overlap itself."
-            return f"{sound}\nThe mesh overlaps itself. {self.result.certificate.summary()}"
-        lines = [
-            f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}. Move the boundary less or in "
-            "several steps, and keep inner loops inside the outer loop."
-        ]
+            lines += [f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.", qualities]
+            if not self.result.certificate.bijective and self.F.shape[1] == 6:
+                lines.append("The straight triangles between the nodes overlap, so the mesh may overlap itself.")
+            elif not self.result.certificate.bijective:
+                lines.append(f"The mesh overlaps itself. {self.result.certificate.summary()}")
+            return "\n".join(lines)
+        where = f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}."
+        advice = " Move the boundary less or in several steps, and keep inner loops inside the outer loop."
+        lines.append(where if ended_early else where + advice)
         if self.forbidden.size:
             lines.append(
                 f"Inverted for every position of the free nodes: {name_elements(self.F, self.forbidden)}. Split "
                 "these elements, or move their nodes less."
             )
         if not self.result.injective:
-            lines.append(self.result.status.value)
+            if not ended_early:
+                lines.append(self.status.value)
             if self.result.diagnosis is not None and self.result.diagnosis.obstructions:
                 lines.append(self.result.diagnosis.summary())
         return "\n".join([*lines, qualities])

@@ -90,7 +90,8 @@ def morph(
         triangles, so a graded mesh stays graded. None returns the first valid mesh. For tetrahedra every name
         selects the same isotropic energy.
     max_iterations : int
-        Maximum number of linear solves to find a valid mesh.
+        Maximum number of linear solves to find a valid mesh. In the plane, a tenth of it limits the Newton steps that
+        then lower the energy, but at least 200 are allowed.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
     callback : callable, optional

@@ -16,7 +16,7 @@ from quasiharmonic.apps.mesh_motion.midsides import centre_midsides, restore_mid
 from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.newton.sliding_boundary import move_onto
-from quasiharmonic.energies.polishing import polish_result
+from quasiharmonic.energies.polishing import limit_polish, polish_result
 from quasiharmonic.geometry.curves.boundary_curves import BoundaryCurves
 from quasiharmonic.geometry.curves.curve import Curve
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
@@ -103,10 +103,15 @@ class NodeSearch:
         own, own_fixed = np.searchsorted(used, triangles), np.searchsorted(used, fixed[known])
         # With the mesh's own reference triangles, the search starts from the harmonic extension of the displacement.
         problem = Problem(self.rest[used], own, own_fixed, target[known], reference="corrected")
-        curves = _select_curves(slide.curves, problem, used, slide.held)
         corners = np.searchsorted(used, corner_triangles(F)[0]) if F.shape[1] == 4 else None
-        if curves is not False:
-            problem = move_onto(curves, problem)
+        try:
+            curves = _select_curves(slide.curves, problem, used, slide.held)
+            problem = problem if curves is False else move_onto(curves, problem)
+        except ValueError:
+            if isinstance(slide.curves, BoundaryCurves):
+                raise
+            # The moved boundary touches or crosses itself, so it is no curve to slide along: search with it fixed.
+            curves = False
         start, iterations = None if begin is None else begin[used], self.options.max_iterations
         result = solve(problem, start=start, max_iterations=iterations, linear_solver=linear_solver, callback=callback)
         if result.status is Status.INTERRUPTED:
@@ -115,7 +120,12 @@ class NodeSearch:
             result = make_convex(problem, result, corners, linear_solver=linear_solver)
         if energy is not None and not inverted_triangles(own if corners is None else corners, result.uv).size:
             polishing = PolishOptions(
-                energy=energy, tol=self.options.tol, linear_solver=linear_solver, callback=callback, slide=curves
+                energy=energy,
+                max_iterations=limit_polish(iterations),
+                tol=self.options.tol,
+                linear_solver=linear_solver,
+                callback=callback,
+                slide=curves,
             )
             result = polish_result(problem, result, polishing, triangles=corners)
         after = points.copy()
@@ -154,10 +164,10 @@ def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linea
 
     The quadrilaterals are convex in the rest mesh, and ``corners`` (t, 3) are the triangles at all their corners. The
     result has an additional stage if steps were taken. Its status is `Status.STALLED` if corners stay inverted; the map
-    then has the fewest inverted corners found.
+    then has the fewest inverted corners found. A result with `Status.IMPOSSIBLE` is returned unchanged.
     """
     before = inverted_triangles(corners, result.uv).size
-    if not before:
+    if not before or result.status is Status.IMPOSSIBLE:
         return result
     run, steps = Run(), 0
     exponent = find_exponent(result.uv)

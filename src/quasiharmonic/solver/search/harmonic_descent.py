@@ -179,7 +179,7 @@ class HarmonicDescentTuning(NamedTuple):
 
 _TUNING = HarmonicDescentTuning()
 
-# Newton steps, and local repairs, for the last inverted triangles.
+# Maximum number of Newton steps, and of local repairs, for the last inverted triangles.
 UNTANGLING_STEPS = 40
 
 
@@ -254,11 +254,12 @@ class HarmonicDescent:
             return steps.converged
         return False
 
-    def untangle(self) -> bool:
-        """Untangle the last inverted triangles by descending V₃ alone; return whether none is left."""
+    def untangle(self, most: int) -> bool:
+        """Untangle the last inverted triangles by at most ``most`` steps down V₃ alone; return whether none is left."""
         if self._run.history[-1].inverted == 0:
             return True
-        for method in (Newton(iterations=UNTANGLING_STEPS), LocalRepair(tries=UNTANGLING_STEPS)):
+        steps = min(most, UNTANGLING_STEPS)
+        for method in (Newton(iterations=steps), LocalRepair(tries=steps)):
             with self._stage(f"{method.label}, tanh"):
                 self._last = self._objective.evaluate(self._last.xi)
                 for at in method.iterates(self._objective, self._last):

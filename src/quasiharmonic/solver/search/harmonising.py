@@ -117,7 +117,8 @@ def harmonise(
         If True, compare lengths and areas after scaling the map to the surface's area. If False, compare them unscaled,
         so that weighted triangles can keep their size while the others fill the remaining area.
     max_iterations : int
-        Maximum number of linear solves per round.
+        Maximum number of linear solves per round. Newton steps then untangle the last inverted triangles: at most as
+        many as all rounds may take, and at most 40.
     tol : float
         A round has converged if ten steps lower its objective by less than this fraction. Not negative.
     reference : {"equilateral", "rest", "corrected"}
@@ -223,7 +224,8 @@ def harmonise_map(domain: Domain, uv: ArrayLike, options: HarmoniseOptions) -> M
                     stage = f"harmonise, {name}, η = {value:g}"
                     at_minimum = descent.run(stage, value, options.max_iterations, options.tol)
                     status = Status.POLISHED if at_minimum else Status.STILL_FALLING
-                done = descent.untangle() and (descent.best < first or status is Status.POLISHED)
+                untangled = descent.untangle(len(schedule) * options.max_iterations)
+                done = untangled and (descent.best < first or status is Status.POLISHED)
                 if done or values == len(schedule) * schedule[-1:]:
                     break
                 # The schedule's long steps left inverted triangles that could not be untangled, or the result is worse

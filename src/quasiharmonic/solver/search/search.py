@@ -297,7 +297,7 @@ def finish_search(search: Search, strategy: str | Stages) -> MapResult:
         stages=search.work.stages,
         history=search.work.history,
         path=search.work.path,
-        diagnosis=search.diagnosis,
+        diagnosis=None if certificate.injective else search.diagnosis,
         linear_solver=search.linear_solver,
         seconds=spent + time.perf_counter() - began,
         mu=None if search.best_field is None else search.best_field.mu,

@@ -98,7 +98,7 @@ class Settings(DescentOptions):
         The boundary vertices that go to the corners of ``to``: ``"auto"``, ``"near:x,y,z,…"``, or any other form that
         `quasiharmonic.targets.boundary.corner_pins.read_corners` reads.
     refine : bool
-        Whether edges may be split if the target has no map without; new vertices are appended.
+        Whether edges may be split if no map is found quickly without; new vertices are appended.
     strategy : {"speed", "paper"}
     functional, parameterisation : str or None
     iterations : int or None

@@ -27,7 +27,7 @@ from quasiharmonic.apps.atlas import island_functions as atlas
 from quasiharmonic.apps.atlas.atlas_verdict import certify
 from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas, each_island, merge_refined, orient_islands
 from quasiharmonic.apps.flattening.free_boundary import check_flattenable
-from quasiharmonic.energies.polishing import polish_result
+from quasiharmonic.energies.polishing import limit_polish, polish_result
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.io.errors import FileInUseError
@@ -241,7 +241,8 @@ def _solve_island(
         return result
     with metadata.time_phase(record, "polish"):
         fine = on_refinement(fitted.problem, result.refined)
-        return polish_result(fine, result, PolishOptions(energy=settings["polish"], slide=slide))
+        steps = limit_polish(settings["max_iterations"])
+        return polish_result(fine, result, PolishOptions(energy=settings["polish"], max_iterations=steps, slide=slide))
 
 
 def _flatten_islands(surface: SeamedMesh, settings: dict[str, Any], record: Record, tell: Tell) -> MappedAtlas:
