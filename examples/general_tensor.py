@@ -17,8 +17,7 @@ from scipy.sparse import csc_array, csr_array, diags
 
 from common import panels, run, save, show
 from quasiharmonic import Problem, boundary_loops, quasi_harmonic_map, solve
-from quasiharmonic.geometry.mesh.operators import operators
-from quasiharmonic.geometry.mesh.reference import Reference, ReferenceMesh
+from quasiharmonic.geometry.mesh.reference import Reference, ReferenceMesh, operators
 from quasiharmonic.surfaces import disk
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, names_of
 

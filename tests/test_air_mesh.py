@@ -142,6 +142,14 @@ def test_thin_triangles_are_raised_to_the_gap():
         (lambda V, F, frame: (V, F, [square(1)]), "and the container meet at|not inside"),
         (lambda V, F, frame: (V, F, [square(4), square(1, 1)]), "and obstacle 0 meet at"),
         (lambda V, F, frame: (V, F, [square(4), square(1, 9)]), "not inside"),
+        (
+            lambda V, F, frame: (V, F, [square(4)[[0, 9, *range(1, 9)]]]),
+            r"the container meets itself at \(-?\d.*, -?\d",
+        ),
+        (
+            lambda V, F, frame: (V, F, [square(9), square(2, 3), square(1, 3)]),
+            r"the loop with a corner at \(.*\) is inside the loop with a corner at \(.*\): move it out",
+        ),
         (lambda V, F, frame: (V, F, [square(4) * np.nan]), "loop 0 of the frame is not finite at points 0, 1, "),
         (lambda V, F, frame: (V, F, []), "frame has no loops: the first must be the container"),
         (lambda V, F, frame: (V, F, frame[0]), r"not a single loop: pass \[frame\]"),

@@ -29,8 +29,7 @@ from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import ARAP
 from quasiharmonic.geometry.exact.loops import contacts
-from quasiharmonic.geometry.mesh.operators import operators
-from quasiharmonic.geometry.mesh.reference import ReferenceMesh
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh, operators
 from quasiharmonic.geometry.mesh.topology import boundary_loops, components
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.problem import Domain

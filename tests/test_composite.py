@@ -10,7 +10,7 @@ from quasiharmonic.energies.deformation import signed_areas
 from quasiharmonic.geometry.exact.constrained_delaunay import triangulate_inside
 from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import Composite, VectorAdam
-from quasiharmonic.solver.methods.composite import composite_map, polygon_triangles
+from quasiharmonic.solver.methods.vector_adam import composite_map, polygon_triangles
 from quasiharmonic.surfaces import annulus, disk
 from quasiharmonic.util.arrays import cyclic_pairs, to_points
 from shared.solvable_problems import star_problem

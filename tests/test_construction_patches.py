@@ -8,8 +8,7 @@ import pytest
 from quasiharmonic import Problem, boundary_loops, injective_map
 from quasiharmonic.geometry.exact.certificate import inverted_triangles
 from quasiharmonic.solver import refinement
-from quasiharmonic.solver.construction.constructing import constructions
-from quasiharmonic.solver.construction.patches import construct_patches
+from quasiharmonic.solver.construction.constructing import construct_patches, constructions
 from quasiharmonic.solver.methods import Composite, LineShift
 from quasiharmonic.surfaces import annulus, disk, grid
 from quasiharmonic.targets import boundary_to

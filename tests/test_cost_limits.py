@@ -18,7 +18,8 @@ from quasiharmonic.solver.field.objective import Objective
 from quasiharmonic.solver.methods import VectorAdam
 from quasiharmonic.solver.search.search import allowed_repairs
 from quasiharmonic.surfaces import disk
-from quasiharmonic.targets import arc_length, letter, rectangle
+from quasiharmonic.targets import arc_length, letter, rectangle, star
+from quasiharmonic.targets import disk as circle
 from quasiharmonic.util.kernels import extension
 from shared.meshes import lift
 
@@ -137,6 +138,10 @@ def peak(call, *arguments):
 
 class TestAllocations:
     """Peak bytes per triangle, without the memory that libraries allocate themselves."""
+
+    def test_many_corners_of_an_outline(self):
+        most, placed = peak(lambda: arc_length(circle(1.0, 12000), star(3000)))
+        assert most < 1000 * len(placed)
 
     def test_problem(self):
         arrays = posed(80, "C")

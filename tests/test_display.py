@@ -142,7 +142,7 @@ def test_a_display_never_fails(monkeypatch):
     ):
         text = html(shown)
         assert not Reader(text).pictures
-    assert "no picture: V is not finite" in text
+    assert "no picture: uv is not finite" in text
     monkeypatch.setattr("quasiharmonic.ui.display.MAX_TRIANGLES", 10)
     assert "96 triangles: call .plot() to draw them" in html(RESULT)
     assert MAX_TRIANGLES > 100_000

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Status, boundary_loops, certify, flatten
-from quasiharmonic.apps.flattening.connected_parts import align_with_axis
 from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.piece import align_with_axis
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.derivatives import check_energy
 from quasiharmonic.energies.energies import Deformation, Isotropic, SymmetricDirichlet

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Status, certify, distortion, flatten, keep_distances, surfaces
-from quasiharmonic.apps.flattening import free_boundary, initial_maps
-from quasiharmonic.apps.flattening.coarse_distances import lower_coarse_distance_error
+from quasiharmonic.apps.flattening import free_boundary
+from quasiharmonic.apps.flattening import piece as pieces
 from quasiharmonic.apps.flattening.contacts import Rim
 from quasiharmonic.apps.flattening.distance_descent import DistanceEnergy, DistancePairs, lower_distance_error
+from quasiharmonic.apps.flattening.large_surfaces import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
 from quasiharmonic.energies.distances import surface_distances
@@ -327,12 +328,12 @@ def test_ctrl_c_on_the_coarse_mesh_returns_a_map_of_the_surface(folded, asked):
 @pytest.mark.parametrize("rings", [20, pytest.param(120, marks=pytest.mark.nightly)])
 def test_a_large_surface_is_flattened_by_way_of_a_coarse_mesh(rings, monkeypatch):
     if rings < 120:
-        for module in (initial_maps, free_boundary):
+        for module in (pieces, free_boundary):
             monkeypatch.setattr(module, "COARSE_FROM", 1_500)
         coarse = partial(lower_coarse_distance_error, least=400)
         monkeypatch.setattr(free_boundary, "lower_coarse_distance_error", coarse)
     V, F = surfaces.cat(rings)
-    assert len(F) >= initial_maps.COARSE_FROM
+    assert len(F) >= pieces.COARSE_FROM
     plain, found = (flatten(V, F, **options) for options in ({}, {"energy": "distances"}))
     sample = surface_distances(V, F, sources=150, targets=150)
     assert found.stages[-1].name == "guarded descent, distances, coarse"

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from quasiharmonic import Status, certify, distortion, find_cuts, flatten, is_injective
-from quasiharmonic.apps.flattening import distance_descent, free_boundary, initial_maps
-from quasiharmonic.apps.flattening.coarse_distances import lower_coarse_distance_error
+from quasiharmonic.apps.flattening import distance_descent, free_boundary
+from quasiharmonic.apps.flattening import piece as pieces
 from quasiharmonic.apps.flattening.contacts import Rim
+from quasiharmonic.apps.flattening.large_surfaces import lower_coarse_distance_error
 from quasiharmonic.apps.flattening.multilevel import Hierarchy, Level, descend_level, flatten_coarse, map_to_disk
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.worst_triangles import smooth_map, thick_energy
@@ -224,10 +225,10 @@ def test_a_coarse_start_separates_the_two_sides_of_a_seam(arms, guarded):
 )
 def test_a_large_surface_with_limbs_does_not_collapse(linear_solver, rings, monkeypatch):
     if rings < 66:
-        for module in (initial_maps, free_boundary):
+        for module in (pieces, free_boundary):
             monkeypatch.setattr(module, "COARSE_FROM", 4_000)
     V, F = cut_starfish(3, rings, 0.1)
-    assert len(F) >= initial_maps.COARSE_FROM
+    assert len(F) >= pieces.COARSE_FROM
     result = flatten(V, F, linear_solver=linear_solver)
     assert result.certificate.bijective
     assert result.status is Status.POLISHED

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from quasiharmonic import Problem, certify, solve
-from quasiharmonic.geometry.mesh.operators import operators
+from quasiharmonic.geometry.mesh.reference import operators
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.solver.field.functionals import beltrami_gradient, neumann_target
 from quasiharmonic.solver.field.objective import Objective

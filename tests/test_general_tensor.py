@@ -15,8 +15,7 @@ from general_tensor import (
     vertex_conormal,
 )
 from quasiharmonic import Problem, quasi_harmonic_map
-from quasiharmonic.geometry.mesh.operators import operators
-from quasiharmonic.geometry.mesh.reference import ReferenceMesh
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh, operators
 from quasiharmonic.solver.field.tensor import TANH
 from quasiharmonic.surfaces import random_delaunay
 from shared.meshes import bend, boundary_of, lift, random_xi, signed_areas, surfaces

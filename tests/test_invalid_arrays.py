@@ -183,6 +183,13 @@ def test_objects_and_mixed_integers_are_indices():
             certify(np.array([[0, 1, entry]], dtype=object), UV)
 
 
+def test_masked_elements_are_rejected():
+    assert certify(np.ma.array(F), np.ma.array(UV)).injective
+    for wrong in ((np.ma.masked_equal(F, 3), UV), (F, np.ma.masked_less(UV, 0))):
+        with pytest.raises(ValueError, match=r"has masked elements: fill them or leave them out$"):
+            certify(*wrong)
+
+
 def test_invalid_frames():
     for frame in (None, 3, "rect:2x1"):
         with pytest.raises(ValueError, match=r"frame must be a list of loops \(k, 2\), .*, not"):

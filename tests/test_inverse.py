@@ -310,8 +310,10 @@ def test_invalid_input_is_named():
         inverse.plane(SurfacePoints(np.array([3, 54]), np.full((2, 3), 1 / 3)))
     with pytest.raises(ValueError, match="a planar surface has no normals"):
         inverse.normals(at)
-    with pytest.raises(ValueError, match="at least 2 points along each axis, not 1 by 5"):
+    with pytest.raises(ValueError, match="columns must be an integer of at least 2, not 1"):
         inverse.sample_grid(1, 5)
+    with pytest.raises(ValueError, match=r"rows must be an integer of at least 2, not 3\.5"):
+        inverse.sample_grid(3, 3.5)
 
 
 def test_transfer_between_meshes_of_one_square(rng):

@@ -16,8 +16,8 @@ from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import MIPS
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
-from quasiharmonic.solver.field.harmonised import Conformal, Harmonised
 from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.search.harmonic_descent import Conformal, Harmonised
 from shared.meshes import bend, lift, random_annulus, random_xi
 
 

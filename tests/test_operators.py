@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quasiharmonic.geometry.mesh.operators import operators
-from quasiharmonic.geometry.mesh.reference import ReferenceMesh
+from quasiharmonic.geometry.mesh.reference import ReferenceMesh, operators
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.solver.field.tensor import TANH
 from quasiharmonic.surfaces import annulus, random_delaunay

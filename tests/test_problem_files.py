@@ -48,6 +48,8 @@ def test_rounding_in_z_leaves_a_mesh_planar(put):
 def test_map_of_some_faces_only_is_rejected(put):
     with pytest.raises(MeshFileError, match=r"face 1 \(0-based\) without texture coordinates"):
         io.map_of(io.read_mesh(put(SQUARE + SQUARE_VT + "f 1/1 2/2 3/3\nf 1 3 4\n")))
+    with pytest.raises(MeshFileError, match=r"face 1 \(0-based\) .*qhm unwrap --faces"):
+        io.map_of(io.read_mesh(put(SQUARE + SQUARE_VT + "f 1/1 2/2 3/3 4/4\nf 1 3 4\n")))
 
 
 def test_a_vertex_without_a_face_has_no_position(put):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import boundary_loops, flatten
-from quasiharmonic.apps.flattening.rigid_steps import find_almost_isometry
+from quasiharmonic.apps.flattening.large_surfaces import find_almost_isometry
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import SymmetricDirichlet
@@ -78,7 +78,7 @@ def test_rigid_steps_flatten_a_rolled_sheet(seed):
 
 def test_the_last_inverted_triangles_are_relocated(monkeypatch):
     V, F = rolled_sheet(130, turns=4.0)
-    module = "quasiharmonic.apps.flattening.rigid_steps"
+    module = "quasiharmonic.apps.flattening.large_surfaces"
     maps = []
     monkeypatch.setattr(f"{module}.is_injective", lambda F, uv: [maps.append(uv), is_injective(F, uv)][1])
     assert is_injective(F, find_almost(V, F).uv)

@@ -43,11 +43,20 @@ def test_only_mirror_images_are_stacked(model, stack, axis, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("words", "count"), [((), 4), (("--stack",), 1), (("--stack", "mirrored"), 2)])
-def test_command_line(model, tmp_path, words, count):
+@pytest.mark.parametrize(
+    ("words", "count"),
+    [
+        ((), 4),
+        (("--stack",), 1),
+        (("--stack", "mirrored"), 2),
+        (("--stack", "mirrored", "--symmetry", "none"), 4),
+    ],
+)
+def test_command_line(model, tmp_path, words, count, capsys):
     io.write_obj(tmp_path / "in.obj", io.MeshData(*model))
     call = ("unwrap", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--resolution", 256, "--max-stretch", 3)
     assert run(*call, *words) == 0
+    assert ("--stack mirrored has no effect" in capsys.readouterr().out) == ("none" in words)
     written = io.read_mesh(tmp_path / "out.obj")
     size = len(written.F) // 4
     centres = [written.vt[np.unique(written.FT[k * size : (k + 1) * size])].mean(axis=0) for k in range(4)]

@@ -12,9 +12,8 @@ from quasiharmonic import atlas, inspect_mesh, io
 from quasiharmonic.geometry.mesh.topology import are_sides
 from quasiharmonic.surfaces import annulus, cat, grid, starfish
 from quasiharmonic.ui.studio import setup
-from quasiharmonic.ui.studio.setup import make_first_state
+from quasiharmonic.ui.studio.setup import make_first_state, unwrap_model
 from quasiharmonic.ui.studio.surface import MAX_TRIANGLES, make_sheet
-from quasiharmonic.ui.studio.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.validation import RequestError
 from shared.pages import Visitor
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
 from quasiharmonic import targets
+from quasiharmonic.targets.boundary.correspondence import arc_parameters
 from shared.contours import steps
 
 # --- outlines
@@ -40,3 +43,17 @@ def test_first_points():
 
 def test_area_far_from_the_origin():
     assert targets.signed_area(targets.rectangle(2, 1) + 1e8) == pytest.approx(2)
+
+
+@pytest.mark.parametrize("count", [7, 9, 12])
+def test_corners_take_the_vertices_that_are_closest_in_total(count, rng):
+    corners = targets.star(3, 0.1)
+    for _ in range(20):
+        turn = np.sort(rng.random(count)) * 2 * np.pi
+        loop = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        placed = targets.arc_length(loop, corners, start=0)
+        where = [int(np.flatnonzero((placed == corner).all(axis=1))[0]) for corner in corners]
+        along, wanted = arc_parameters(loop), arc_parameters(corners)
+        every = np.array(list(itertools.combinations(range(1, count), 5)))
+        costs = ((along[every] - wanted[1:]) ** 2).sum(axis=1)
+        assert costs.min() == pytest.approx(((along[where] - wanted) ** 2).sum())

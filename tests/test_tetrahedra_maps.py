@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from quasiharmonic import MovingMesh, certify_tetrahedra, injective_tetrahedra, morph
-from quasiharmonic.apps.tetrahedra.block_matrix import BlockMatrix
 from quasiharmonic.apps.tetrahedra.contacts import edges_meeting_triangles
-from quasiharmonic.apps.tetrahedra.descent import ShapeEnergy, reduce_epsilon, regularise
+from quasiharmonic.apps.tetrahedra.descent import BlockMatrix, ShapeEnergy, reduce_epsilon, regularise
 from quasiharmonic.apps.tetrahedra.result import TetrahedraStatus, tetrahedron_quality
 from quasiharmonic.io.fem.files import read_volume
 from quasiharmonic.ui.cli import main

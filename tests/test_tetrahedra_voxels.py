@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify_tetrahedra, inverse_field, nearest_invertible
-from quasiharmonic.apps.displacement_fields.voxel_grid import VoxelGrid, find_folded_cells
+from quasiharmonic.apps.displacement_fields.nearest_voxels import VoxelGrid, find_folded_cells
 from shared.exact_space import determinant, exact
 from shared.tetrahedral_meshes import folded_volume
 

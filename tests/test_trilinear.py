@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic.apps.displacement_fields.nearest import fold_free, least_coefficients
-from quasiharmonic.apps.displacement_fields.voxel_grid import VoxelGrid
+from quasiharmonic.apps.displacement_fields.nearest_voxels import VoxelGrid
 from quasiharmonic.ui.cli import main
 
 

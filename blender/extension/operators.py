@@ -18,8 +18,8 @@ from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.results import Step
 from quasiharmonic.solver.mapping import solve
+from quasiharmonic.targets.boundary.boundary_to import fit_boundary
 from quasiharmonic.targets.boundary.corner_pins import CornerSpec
-from quasiharmonic.targets.boundary.fitted_problems import fit_boundary
 from quasiharmonic.util.arrays import IntArray, count_of
 from quasiharmonic.util.options import ENERGY_LABELS, PolishOptions
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.atlas_verdict import MIRROR
 from quasiharmonic.apps.atlas.mapped_atlas import each_island, fit_in_place
-from quasiharmonic.apps.flattening.connected_parts import place_in_row
 from quasiharmonic.apps.flattening.free_boundary import flatten
+from quasiharmonic.apps.flattening.piece import place_in_row
 from quasiharmonic.energies.polishing import polish_map
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh

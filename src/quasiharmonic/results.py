@@ -10,10 +10,9 @@ from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
 from quasiharmonic.apps.atlas.packing.pack import Packing
 from quasiharmonic.apps.atlas.seam_cuts import CutMesh
 from quasiharmonic.apps.baking import BakeResult
-from quasiharmonic.apps.displacement_fields.field_inversion import InverseField
+from quasiharmonic.apps.displacement_fields.field_inversion import InverseField, InverseVolume
 from quasiharmonic.apps.displacement_fields.nearest import InvertibleField
 from quasiharmonic.apps.displacement_fields.nearest_voxels import InvertibleVolume, VoxelVerdict
-from quasiharmonic.apps.displacement_fields.voxel_inversion import InverseVolume
 from quasiharmonic.apps.gradients.derivative import Derivative
 from quasiharmonic.apps.image_warp import WarpResult
 from quasiharmonic.apps.inverse_map import ChartInverse, SurfacePoints

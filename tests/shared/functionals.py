@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quasiharmonic import Problem
-from quasiharmonic.geometry.mesh.operators import operators
+from quasiharmonic.geometry.mesh.reference import operators
 from quasiharmonic.solver.field.functionals import FUNCTIONALS
 from shared.meshes import bend, boundary_of, surfaces
 

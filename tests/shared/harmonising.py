@@ -11,8 +11,8 @@ from quasiharmonic import (
     quasi_harmonic_map,
 )
 from quasiharmonic.energies.deformation import DeformationEnergy, signed_areas
-from quasiharmonic.solver.field.harmonised import Conformal, Harmonised
 from quasiharmonic.solver.field.objective import Objective
+from quasiharmonic.solver.search.harmonic_descent import Conformal, Harmonised
 from quasiharmonic.surfaces import grid, random_delaunay
 from quasiharmonic.targets import arc_length
 from shared.meshes import bend, boundary_of, lift

@@ -325,9 +325,12 @@ def triangulate_between(points: FloatArray, loops: Sequence[IntArray], frame: Se
             raise ValueError(f"the loop with a corner at {tuple(thing[0].tolist())} is not inside the container")
         inside[min(holding, key=lambda k: rooms[k].area)].append(thing)
     regions = [shapely.Polygon(space, things) for space, things in zip(spaces, inside, strict=True)]
-    for region in regions:
+    for region, things in zip(regions, inside, strict=True):
         if not region.is_valid:
-            raise ValueError(f"shapes, container and obstacles must not meet: {shapely.is_valid_reason(region)}")
+            blocks = [shapely.Polygon(thing) for thing in things]
+            pair = shapely.STRtree(blocks).query(blocks, predicate="contains_properly")[:, 0]
+            outer, inner = (f"the loop with a corner at {tuple(things[k][0].tolist())}" for k in pair)
+            raise ValueError(f"{inner} is inside {outer}: move it out")
     order = {place: index for index, place in enumerate(map(tuple, points.tolist()))}
     corners = shapely.get_coordinates(shapely.constrained_delaunay_triangles(regions)).reshape(-1, 4, 2)[:, :3]
     triangles = np.array([order[x, y] for x, y in corners.reshape(-1, 2).tolist()], dtype=np.int64).reshape(-1, 3)
@@ -336,9 +339,13 @@ def triangulate_between(points: FloatArray, loops: Sequence[IntArray], frame: Se
 
 
 def _check_apart(loops: Sequence[FloatArray], names: Sequence[str]) -> None:
-    """Raise ValueError if loops share a point."""
+    """Raise ValueError if loops share a point, or one crosses or touches itself."""
     shapely = _shapely()
     rings = [shapely.LinearRing(loop) for loop in loops]
+    for name, ring in zip(names, rings, strict=True):
+        if not ring.is_simple:
+            at = shapely.is_valid_reason(ring).partition("[")[2].rstrip("]").replace(" ", ", ")
+            raise ValueError(f"{name} meets itself at ({at})")
     first, second = shapely.STRtree(rings).query(rings, predicate="intersects")
     for i, j in sorted(zip(first.tolist(), second.tolist(), strict=True)):
         if i < j:

@@ -32,6 +32,7 @@ from quasiharmonic.util.arrays import (
     check_bool,
     check_choice,
     check_finite,
+    check_integer,
     check_range,
     index_array,
     list_others,
@@ -348,10 +349,10 @@ class InverseMap(ReadOnly):
         Raises
         ------
         ValueError
-            If there are fewer than 2 points along an axis.
+            If ``columns`` or ``rows`` is not an integer of at least 2.
         """
-        if columns < 2 or rows < 2:
-            raise ValueError(f"a grid needs at least 2 points along each axis, not {columns} by {rows}")
+        check_integer("columns", columns, minimum=2)
+        check_integer("rows", rows, minimum=2)
         if box is None:
             corners = self.uv[self.F]
             box = (*corners.min(axis=(0, 1)).tolist(), *corners.max(axis=(0, 1)).tolist())

@@ -29,7 +29,7 @@ from quasiharmonic.energies.newton.map_model import Coordinates, MapModel, in_un
 from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.newton.newton_system import NewtonSystem
 from quasiharmonic.energies.polishing import find_energy, scale_energy
-from quasiharmonic.geometry.mesh.operators import operators
+from quasiharmonic.geometry.mesh.reference import operators
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.problem import Domain
 from quasiharmonic.problem.result import MapResult, Status

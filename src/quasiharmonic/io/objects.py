@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.mesh.polygons import triangulate_polygons
-from quasiharmonic.io.fem.vtk_cells import find_counts
+from quasiharmonic.io.fem.mesh_parts import find_counts
 from quasiharmonic.io.mesh_files import read_mesh, write_mapped
 from quasiharmonic.io.models.mesh_maps import seamed
 from quasiharmonic.io.models.meshdata import MeshData

@@ -34,8 +34,13 @@ from quasiharmonic.problem import Problem, check_problem
 from quasiharmonic.problem.diagnosis import Diagnosis, diagnose
 from quasiharmonic.problem.result import MapResult, RefinementAttempt, Stage, Status
 from quasiharmonic.problem.run import Run
-from quasiharmonic.solver.construction.constructing import Construction, constructions, is_simple, refined_problem
-from quasiharmonic.solver.construction.patches import construct_patches
+from quasiharmonic.solver.construction.constructing import (
+    Construction,
+    construct_patches,
+    constructions,
+    is_simple,
+    refined_problem,
+)
 from quasiharmonic.solver.construction.thinning import thin_refinement
 from quasiharmonic.solver.search.record import RepairBudget
 from quasiharmonic.solver.search.search import allowed_repairs, search_map

@@ -25,6 +25,7 @@ from quasiharmonic.ui import plot
 from quasiharmonic.ui.plot.canvas import RED, caption, new_figure, png_bytes, verdict
 from quasiharmonic.ui.plot.maps import map_figure
 from quasiharmonic.ui.plot.measures import cut_tetrahedra, elements_figure, outline_elements
+from quasiharmonic.util.arrays import map_array
 from quasiharmonic.util.outcome import Displayable
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def _result(result: MapResult, kind: str, measure: str) -> Figure:
 def _certificate(certificate: Certificate) -> Figure:
     figure = new_figure((4.5, 4.5))
     ax = figure.add_axes((0.01, 0.02, 0.98, 0.88))
-    uv, bad = certificate.uv, _find_bad(certificate)
+    uv, bad = map_array("uv", certificate.uv), _find_bad(certificate)
     plot.plot_map(uv, certificate.F, uv, inverted=bad, ax=ax)
     for i, j, k, m in certificate.crossings.tolist():
         ax.plot(*uv[[i, j]].T, *uv[[k, m]].T, color=RED, linewidth=2.4, zorder=7)

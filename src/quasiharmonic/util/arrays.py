@@ -390,6 +390,8 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
 
 def _array(name: str, values: ArrayLike) -> NDArray[Any]:
     """Convert values, including PyTorch and JAX arrays, to an array, or raise a ValueError that says what they are."""
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name} has masked elements: fill them or leave them out")
     try:
         # `asarray` treats objects that offer their memory only by DLPack as scalars.
         if hasattr(values, "__dlpack__") and not hasattr(values, "__array__"):

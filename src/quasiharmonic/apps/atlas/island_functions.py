@@ -21,7 +21,7 @@ from quasiharmonic.apps.atlas.mapped_atlas import (
     orient_islands,
 )
 from quasiharmonic.apps.flattening import free_boundary
-from quasiharmonic.apps.flattening.connected_parts import fit_unit_square, place_in_row
+from quasiharmonic.apps.flattening.piece import fit_unit_square, place_in_row
 from quasiharmonic.energies.deformation import positive_weights, signed_areas
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.energies.polishing import polish_map
@@ -36,8 +36,8 @@ from quasiharmonic.problem.result import MapResult
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.search.harmonising import harmonise_map
 from quasiharmonic.targets import outline
+from quasiharmonic.targets.boundary.boundary_to import fit_boundary
 from quasiharmonic.targets.boundary.corner_pins import CornerSpec
-from quasiharmonic.targets.boundary.fitted_problems import fit_boundary
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

@@ -24,7 +24,13 @@ from quasiharmonic.apps.displacement_fields.grid import (
     label_patches,
     name_points,
 )
-from quasiharmonic.apps.displacement_fields.nearest_voxels import InvertibleVolume, nearest_invertible_volume
+from quasiharmonic.apps.displacement_fields.nearest_voxels import (
+    InvertibleVolume,
+    VoxelGrid,
+    find_folded_cells,
+    in_units,
+    nearest_invertible_volume,
+)
 from quasiharmonic.apps.displacement_fields.patch_descent import (
     FixedPixelsError,
     descend_patches,
@@ -32,7 +38,6 @@ from quasiharmonic.apps.displacement_fields.patch_descent import (
     find_folds,
     grow_pressing,
 )
-from quasiharmonic.apps.displacement_fields.voxel_grid import VoxelGrid, find_folded_cells, in_units
 from quasiharmonic.apps.tetrahedra.descent import cross
 from quasiharmonic.geometry.exact.certificate import Certificate, certify
 from quasiharmonic.geometry.exact.predicates import orientation
@@ -186,7 +191,7 @@ def nearest_invertible(
     Notes
     -----
     Fields on voxels (d, h, w, 3) have displacements along x, y and z in slice z, row y and column x. Each cell between
-    eight voxels is divided into six tetrahedra (`quasiharmonic.apps.displacement_fields.voxel_grid`), which must be
+    eight voxels is divided into six tetrahedra (`quasiharmonic.apps.displacement_fields.nearest_voxels`), which must be
     positive. The search can fail, also because of fixed pixels: no error is raised then, and the result lists the cells
     that still fold.
 

@@ -20,9 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.flattening.contacts import Rim
-from quasiharmonic.apps.flattening.initial_maps import InitialMap, list_initial_maps
-from quasiharmonic.apps.flattening.piece import Piece, to_given_unit
-from quasiharmonic.apps.flattening.rigid_steps import ALMOST_FROM, AlmostIsometry, find_almost_isometry
+from quasiharmonic.apps.flattening.large_surfaces import ALMOST_FROM, AlmostIsometry, find_almost_isometry
+from quasiharmonic.apps.flattening.piece import InitialMap, Piece, list_initial_maps, to_given_unit
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import PatchDescents, has_collapsed
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet

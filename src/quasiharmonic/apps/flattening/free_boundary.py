@@ -18,18 +18,20 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.apps.flattening.coarse_distances import lower_coarse_distance_error
-from quasiharmonic.apps.flattening.connected_parts import (
+from quasiharmonic.apps.flattening.distance_descent import DistanceKeywords, lower_distance_error
+from quasiharmonic.apps.flattening.flattening_run import Flattening
+from quasiharmonic.apps.flattening.large_surfaces import lower_coarse_distance_error
+from quasiharmonic.apps.flattening.piece import (
+    COARSE_FROM,
     Part,
+    Piece,
     align_with_axis,
+    check_in_range,
     fit_unit_square,
     place_in_row,
     split_parts,
+    to_given_unit,
 )
-from quasiharmonic.apps.flattening.distance_descent import DistanceKeywords, lower_distance_error
-from quasiharmonic.apps.flattening.flattening_run import Flattening
-from quasiharmonic.apps.flattening.initial_maps import COARSE_FROM
-from quasiharmonic.apps.flattening.piece import Piece, check_in_range, to_given_unit
 from quasiharmonic.energies.deformation import positive_weights
 from quasiharmonic.energies.energies import Energy, SymmetricDirichlet
 from quasiharmonic.energies.polishing import find_energy

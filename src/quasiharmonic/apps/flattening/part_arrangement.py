@@ -17,8 +17,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from quasiharmonic.apps.flattening.connected_parts import Part, name_part, unite_parts
 from quasiharmonic.apps.flattening.contacts import nearest_on_edges
+from quasiharmonic.apps.flattening.piece import Part, name_part, unite_parts
 from quasiharmonic.apps.flattening.pin_obstructions import find_pin_obstructions
 from quasiharmonic.apps.flattening.pin_search import PinSearch
 from quasiharmonic.energies.newton.map_model import in_units

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.gradients.forces import Forces, Strain, TensorForces, TriangleResponse
-from quasiharmonic.apps.gradients.gauge import Gauge
+from quasiharmonic.apps.gradients.freedom import Gauge
 from quasiharmonic.util.arrays import (
     BoolArray,
     ComplexArray,

@@ -21,8 +21,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.gradients.derivative import Derivative, Doubt, Equilibrium, Scale
 from quasiharmonic.apps.gradients.forces import CorrectedStrain, Forces, RestStrain, Strain, TensorForces
-from quasiharmonic.apps.gradients.freedom import Freedom, SlidingFreedom
-from quasiharmonic.apps.gradients.gauge import Gauge, differentiate_map_size
+from quasiharmonic.apps.gradients.freedom import Freedom, Gauge, SlidingFreedom, differentiate_map_size
 from quasiharmonic.apps.gradients.minimum import Minimum
 from quasiharmonic.energies.deformation import DeformationEnergy, positive_weights, signed_areas
 from quasiharmonic.energies.energies import Energy, QuadraticForm
@@ -307,7 +306,7 @@ def flatten_derivative(
     -------
     Derivative
         The derivative of the energy's minimum near ``uv``; this map is ``Derivative.uv``. Without fixed vertices, the
-        derivative is that of the map nearest to ``uv`` (`quasiharmonic.apps.gradients.gauge`), although `flatten`
+        derivative is that of the map nearest to ``uv`` (`quasiharmonic.apps.gradients.freedom`), although `flatten`
         would lay it out differently. Use functions that do not depend on the map's position and rotation. With one
         fixed vertex the map can rotate about it, so the same holds for its rotation.
 

@@ -15,9 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.flattening.flattening_run import Flattening
-from quasiharmonic.apps.flattening.initial_maps import COARSE_FROM
 from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
-from quasiharmonic.apps.flattening.piece import Piece
+from quasiharmonic.apps.flattening.piece import COARSE_FROM, Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import descend_on_patches
 from quasiharmonic.energies.deformation import DeformationEnergy

@@ -265,7 +265,7 @@ def clean(
     )
     # In this unit, products neither overflow nor underflow.
     points = np.pad(np.ldexp(V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
-    points, moved, thin, degenerate, area = widen(points, joint[F], V.shape[1])
+    points, moved, thin, degenerate, twice_area = widen(points, joint[F], V.shape[1])
     # Triangles with corners at equal positions are degenerate without welding, too.
     apart = (V[F] != V[F[:, (1, 2, 0)]]).any(axis=2).all(axis=1)
     collapsed = np.flatnonzero(are_collapsed(joint[F]) & apart)
@@ -275,7 +275,7 @@ def clean(
         raise ValueError(f"{every} uses a vertex twice or has no area" + merged * bool(collapsed.size))
     exclusion = exclude(points, joint[F], degenerate)
     rows = exclusion.triangles
-    sheets = join_sheets(points, joint[F[rows]], F[rows], area[rows], thin[rows])
+    sheets = join_sheets(points, joint[F[rows]], F[rows], twice_area[rows], thin[rows])
     corners = F[rows]
     number, vertices = _number(sheets.fan, corners)
     positions, moved = V[joint[vertices]], moved[joint[vertices]]

@@ -47,7 +47,7 @@ class Widened(NamedTuple):
         Triangles that are widened.
     degenerate : (f,) bool
         Triangles that have no area, before or after.
-    area : (f,) float64
+    twice_area : (f,) float64
         Areas before, times two.
     """
 
@@ -55,7 +55,7 @@ class Widened(NamedTuple):
     moved: BoolArray
     thin: BoolArray
     degenerate: BoolArray
-    area: FloatArray
+    twice_area: FloatArray
 
 
 def widen(points: FloatArray, F: IntArray, dimension: int) -> Widened:
@@ -73,14 +73,14 @@ def widen(points: FloatArray, F: IntArray, dimension: int) -> Widened:
         If it is 2, vertices stay in the plane of the first two coordinates.
     """
     base, tip = rest_frames(points, F)
-    area = base * tip.imag
+    twice_area = base * tip.imag
     sides = np.stack([base, np.abs(tip - base), np.abs(tip)], axis=1)
     flat = (base == 0) | (tip.imag == 0)
-    size, longest = np.sqrt(np.abs(area).sum() / 2), sides.max(axis=1)
+    size, longest = np.sqrt(np.abs(twice_area).sum() / 2), sides.max(axis=1)
     thin_height = np.maximum(_TUNING.thin * longest, np.minimum(_TUNING.thin_by_area * size, _TUNING.small * longest))
-    thin = flat | (area < thin_height * longest)
+    thin = flat | (twice_area < thin_height * longest)
     if not thin.any():
-        return Widened(points, mark(len(points)), thin, flat, area)
+        return Widened(points, mark(len(points)), thin, flat, twice_area)
     degenerate = _find_degenerate(points, F, sides, flat)
     thin &= ~degenerate
     rows = np.flatnonzero(thin)
@@ -99,7 +99,7 @@ def widen(points: FloatArray, F: IntArray, dimension: int) -> Widened:
     points = points.copy()
     points[apex] += across * (length * np.random.default_rng(0).uniform(0.5, 1, rows.size))[:, None]
     degenerate[near[flat_triangles(points, F[near])]] = True
-    return Widened(points, moved, thin & ~degenerate, degenerate, area)
+    return Widened(points, moved, thin & ~degenerate, degenerate, twice_area)
 
 
 def _find_degenerate(points: FloatArray, F: IntArray, sides: FloatArray, flat: BoolArray) -> BoolArray:

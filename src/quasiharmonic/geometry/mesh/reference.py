@@ -1,4 +1,4 @@
-"""Reference triangles: the triangles in which gradients are computed (§9.3, §F.1).
+"""Reference triangles, in which gradients are computed (§9.3, §F.1), and the operators of §6.2 from these gradients.
 
 Whether an injective map exists depends on the connectivity of the triangles and not on their shapes. So the triangle in
 which ``G`` and ``m`` are computed is a free choice. Each reference triangle has its own frame, with vertex 0 at
@@ -14,6 +14,9 @@ the origin and vertex 1 on the positive x axis, written as complex numbers::
 rest triangles are always the triangles of the mesh. They have no sign, because a
 planar mesh counts as a surface seen from the side on which its triangles are counterclockwise. So the image of a
 triangle is inverted exactly if the certificate lists it as inverted.
+
+The `Operators` are sparse matrices. The solver assembles from the triangles (§F.1) and does not use them. They relate
+its formulas to those of the paper, and the energy of second derivatives is made of them.
 """
 
 from __future__ import annotations
@@ -22,11 +25,12 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.util.arrays import (
     ComplexArray,
     FloatArray,
@@ -39,6 +43,9 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 from quasiharmonic.util.kernels import compiled
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Reference = Literal["equilateral", "rest", "corrected"]
 
@@ -307,3 +314,70 @@ def rest_shapes(V: ArrayLike, F: NDArray[np.integer], *, lowest: float = 0.0) ->
         z1 = np.where(z1 > 0, z1, longest)
         z2.imag = np.maximum(z2.imag, lowest * longest**2 / np.where(z1 > 0, z1, 1.0))
     return RestShapes(float(np.ldexp(1.0, exponent)), np.stack([z1 + 0j, z2 - z1, -z2]), 0.5 * z1 * z2.imag)
+
+
+@dataclass(frozen=True)
+class Operators:
+    """Discrete operators of a mesh (Table 1).
+
+    Attributes
+    ----------
+    G : (2f, n) sparse
+        Intrinsic gradient: f rows of x derivatives, then f rows of y derivatives.
+    m : (f,) float64
+        Triangle areas.
+    D : (n, n) sparse, antisymmetric
+        Circular boundary gradient (eq. 15 with the signs of §A.1): ``uᵀ D v`` is the signed area.
+    R, S : (n, k) and (n, n - k) sparse
+        Selection of the boundary and of the interior vertices.
+    C : (k, k) sparse
+        ``Rᵀ D R`` (eq. 16).
+    """
+
+    G: csr_array
+    m: FloatArray
+    D: csr_array
+    R: csr_array
+    S: csr_array
+    C: csr_array
+
+    def laplacian(self, a: FloatArray | None = None) -> csr_array:
+        """``Gᵀ A G`` for a tensor field; the cotangent Laplacian by default.
+
+        ``a`` (f, 3) has the entries a11, a12, a22 of ``mⱼ⁻¹ A₍ⱼ₎`` by triangle.
+        """
+        from scipy.sparse import csr_array, diags
+
+        if a is None:
+            a = np.tile([1.0, 0.0, 1.0], (self.m.size, 1))
+        a11, a12, a22 = (csr_array(diags(self.m * entry)) for entry in a.T)
+        f = self.m.size
+        Gx, Gy = self.G[:f], self.G[f:]
+        return csr_array(Gx.T @ (a11 @ Gx + a12 @ Gy) + Gy.T @ (a12 @ Gx + a22 @ Gy))
+
+
+def operators(V: NDArray[np.floating], F: NDArray[np.integer], reference: Reference = "rest") -> Operators:
+    """Build the operators of a mesh; ``reference`` selects the triangles of gradients and areas."""
+    from scipy.sparse import csr_array, vstack
+
+    triangles = own_triangles(F)
+    mesh = ReferenceMesh(np.asarray(V, dtype=np.float64), triangles, reference)
+    f, n = len(triangles), len(V)
+    shape, offsets = (f, n), np.arange(0, 3 * f + 1, 3)
+    Gx, Gy = (
+        csr_array((part.T.ravel(), triangles.ravel(), offsets), shape=shape)
+        for part in (mesh.gamma.real, mesh.gamma.imag)
+    )
+    edge = boundary_edges(triangles, n)
+    half = csr_array((np.full(len(edge), 0.5), (edge[:, 0], edge[:, 1])), shape=(n, n))
+    D = csr_array(half - half.T)
+    boundary = np.unique(edge)
+    R = _selection(boundary, n)
+    S = _selection(np.setdiff1d(np.arange(n), boundary), n)
+    return Operators(csr_array(vstack([Gx, Gy])), np.array(mesh.m), D, R, S, csr_array(R.T @ D @ R))
+
+
+def _selection(rows: NDArray[np.integer], n: int) -> csr_array:
+    from scipy.sparse import csr_array
+
+    return csr_array((np.ones(rows.size), (rows, np.arange(rows.size))), shape=(n, rows.size))

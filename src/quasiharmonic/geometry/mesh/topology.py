@@ -366,5 +366,7 @@ def manifold_edges(F: IntArray, n: int) -> Edges:
 def _check_triangles(F: IntArray) -> None:
     message = "{}: a vertex is used twice in a triangle; remove such triangles with clean"
     reject(are_collapsed(F), "triangle", "triangles", message)
-    message = "{} repeated: the same three vertices occur before; remove repetitions with clean"
+    message = (
+        "{} repeated (a polygon counts as its triangles): the same vertices occur before; remove repetitions with clean"
+    )
     reject(find_twins(F) < np.arange(len(F)), "triangle", "triangles", message)

@@ -10,9 +10,8 @@ from typing import TypeAlias
 import numpy as np
 
 from quasiharmonic.geometry.mesh.elements import join_elements, join_solids
-from quasiharmonic.io.fem.mesh_parts import MeshParts
+from quasiharmonic.io.fem.mesh_parts import SUPPORTED, MeshParts
 from quasiharmonic.io.fem.number_tables import Table, TableReader, replace_numbers, stack_tables
-from quasiharmonic.io.fem.vtk_cells import SUPPORTED
 from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
 

@@ -8,9 +8,8 @@ from urllib.parse import unquote_to_bytes
 
 import numpy as np
 
-from quasiharmonic.io.fem.mesh_parts import MeshParts
+from quasiharmonic.io.fem.mesh_parts import MeshParts, find_counts, find_sets_in_fields, select_elements
 from quasiharmonic.io.fem.number_tables import Table, TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import find_counts, find_sets_in_fields, select_elements
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
 _KINDS = {

@@ -7,9 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from quasiharmonic.io.fem.mesh_parts import MeshParts
+from quasiharmonic.io.fem.mesh_parts import MeshParts, select_elements
 from quasiharmonic.io.fem.number_tables import TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import select_elements
 from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
 

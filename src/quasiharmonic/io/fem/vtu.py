@@ -26,9 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quasiharmonic.io.atomic import write_whole
-from quasiharmonic.io.fem.mesh_parts import MeshParts
+from quasiharmonic.io.fem.mesh_parts import MeshParts, find_sets_in_fields, select_elements
 from quasiharmonic.io.fem.number_tables import TableReader, replace_numbers
-from quasiharmonic.io.fem.vtk_cells import find_sets_in_fields, select_elements
 from quasiharmonic.io.untrusted import check_end
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
@@ -77,8 +76,9 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
     file = _VtuFile(data)
     points = file.find_only("Points", None)
     precision = points.attributes.get("type")
-    if precision not in ("Float32", "Float64") or points.attributes.get("NumberOfComponents") != "3":
-        raise ValueError(f"its positions must be three Float32 or Float64 each, not {precision}")
+    components = points.attributes.get("NumberOfComponents", "1")
+    if precision not in ("Float32", "Float64") or components != "3":
+        raise ValueError(f"its positions must be 3 Float32 or Float64 each, not {components} {precision}")
     place = file.values(points, 3 * file.points).reshape(-1, 3)
     ends, kinds = (
         file.values(file.find_only("Cells", name), file.cells).astype(np.int64) for name in ("offsets", "types")
@@ -134,7 +134,10 @@ class _VtuFile:
             raise ValueError(f"it has {len(self._pieces)} pieces: merge them into one")
         self.points, self.cells = (int(self._pieces[0].get(f"NumberOf{what}", "0")) for what in ("Points", "Cells"))
         self._order = {"LittleEndian": "<", "BigEndian": ">"}.get(self._file.get("byte_order", "LittleEndian"), "<")
-        self._word = np.dtype(self._order + _KINDS[self._file.get("header_type", "UInt32")])
+        word = self._file.get("header_type", "UInt32")
+        if word not in ("UInt32", "UInt64"):
+            raise ValueError(f"its header_type must be UInt32 or UInt64, not {word[:40]}")
+        self._word = np.dtype(self._order + _KINDS[word])
         compressor = self._file.get("compressor")
         if compressor is not None and compressor not in _CODERS:
             raise ValueError(f"it is compressed by {compressor}: save it with ZLib or without compression")
@@ -161,7 +164,7 @@ class _VtuFile:
         """Return the numbers of an array, at most ``max_count`` of them if compressed."""
         kind = _KINDS.get(array.attributes.get("type", ""))
         if kind is None:
-            raise ValueError(f"arrays of {array.attributes.get('type', '')[:40]} are not numbers")
+            raise ValueError(f"arrays of {array.attributes.get('type', 'unknown type')[:40]} are not numbers")
         if array.attributes.get("format") == "ascii":
             text = self._data[array.begin : array.end].split()
             return np.array(text, dtype=np.bytes_).astype(np.float64 if kind[0] == "f" else np.int64).astype(kind)
@@ -268,6 +271,8 @@ class _VtuFile:
         if array.attributes.get("format") != "appended":
             inline = self._data[array.begin : array.end]
             return array.begin + len(inline) - len(inline.lstrip()), _take_base64
+        if "offset" not in array.attributes:
+            raise ValueError(f"the array {array.attributes.get('Name', '')[:40]!r} has no offset in the appended data")
         begin = self._appended + int(array.attributes["offset"])
         if self._appended < 0 or begin > len(self._data):
             raise ValueError("an array refers to appended data that do not exist")

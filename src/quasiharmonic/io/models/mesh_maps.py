@@ -122,12 +122,13 @@ def check_mapped(mesh: MeshData) -> None:
                 remedy="export it with uv coordinates",
             )
         return
-    bare = np.flatnonzero((mesh.FT < 0).any(axis=1))
+    bare = np.unique(mesh.rings.of_triangle[(mesh.FT < 0).any(axis=1)])
     if bare.size:
         raise MeshFileError(
             mesh.source,
             f"{names_of('face', 'faces', bare)} (0-based) without texture coordinates, which other faces have",
-            remedy="map the whole mesh (qhm unwrap, or qhm flatten --seams none), or remove these faces",
+            remedy="map these faces (qhm unwrap --faces) or the whole mesh (qhm unwrap, or qhm flatten --seams none), "
+            "or remove these faces",
         )
 
 

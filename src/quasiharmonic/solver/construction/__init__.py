@@ -7,7 +7,7 @@ The proof that such a map exists is constructive (the documentation has a page w
          ──sides──▶ no edge along a straight side ──embedding──▶ Tutte's map of each ──▶ certified
          ──thinning, opening──▶ as few added vertices as possible
 
-If a map has few inverted triangles, this is done only in `patches` around them.
+If a map has few inverted triangles, this is done only in patches around them.
 
 In exact arithmetic this would suffice. Pieces that rounding inverts are embedded in other ways; if that fails, their
 triangles are reported.

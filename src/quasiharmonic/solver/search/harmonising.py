@@ -24,9 +24,8 @@ from quasiharmonic.problem import Domain, Problem
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.problem.run import Run
-from quasiharmonic.solver.field.harmonised import Conformal, Harmonised
 from quasiharmonic.solver.field.objective import Objective
-from quasiharmonic.solver.search.harmonic_descent import HarmonicDescent
+from quasiharmonic.solver.search.harmonic_descent import Conformal, HarmonicDescent, Harmonised
 from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,

@@ -1,31 +1,39 @@
-"""Target positions on an outline for the whole boundary of a surface.
+"""Target positions on an outline for the whole boundary of a surface, and mapping problems with such targets.
 
 `boundary_to` matches boundary loops to contours, and vertices to positions on them. The holes of a surface are matched
-to those of the outline, and their rotation is chosen. `fitted_problems` makes mapping problems with these positions.
+to those of the outline, and their rotation is chosen.
+
+`fit_boundary` and `fix_in_place` make the mapping problem of an island, with its boundary on an outline or in place.
+Each of several islands is mapped onto its own copy of the outline, and the copies lie in a row.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from quasiharmonic.geometry.curves.boundary_curves import check_corner_angle
 from quasiharmonic.geometry.exact.loops import check_loops, join_items
+from quasiharmonic.geometry.mesh.reference import Reference
 from quasiharmonic.geometry.mesh.splitting import make_fans
+from quasiharmonic.geometry.mesh.topology import boundary_edges, boundary_loops
 from quasiharmonic.io.accepts_mesh import accepts_mesh
+from quasiharmonic.io.seamed_mesh import Island
 from quasiharmonic.linsolve.laplacian import Laplacian
-from quasiharmonic.problem import Domain
-from quasiharmonic.targets.boundary.corner_pins import Corners, Pins, pins_by_angle
+from quasiharmonic.problem import Domain, Problem
+from quasiharmonic.targets.boundary.corner_pins import Corners, CornerSpec, Pins, pins_by_angle
 from quasiharmonic.targets.boundary.correspondence import arc_parameters, project_loop
 from quasiharmonic.targets.boundary.placement import CornerPlacement, chords_of
 from quasiharmonic.targets.boundary.turning import boundary_turning, find_outermost, in_space
 from quasiharmonic.targets.outlines.contours import NestedContour, arrange, filled, from_corner, in_unit
+from quasiharmonic.targets.outlines.contours import corners as corners_of
 from quasiharmonic.targets.specification import outline as specified
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, count_of, describe, to_complex
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, count_of, describe, names_of, to_complex
 
 # Default minimum angle, in degrees, by which an outline turns at a corner.
 DEFAULT_CORNER_ANGLE = 20.0
@@ -233,8 +241,8 @@ def boundary_to(
 def _contours(outline: Sequence[ArrayLike] | FloatArray | str | PathLike[str], surface: Domain) -> list[ArrayLike]:
     """The given contours, or those that the specification describes."""
     if isinstance(outline, str | PathLike):
-        described = specified(outline)
-        return list(filled(described)) if len(surface.loops) == 1 else list(described)
+        described = list(specified(outline))
+        return list(filled(described)) if len(surface.loops) == 1 < len(described) else list(described)
     if not isinstance(outline, Iterable):
         raise ValueError(f'outline must be contours (k, 2), or words as "letter:R", not {describe(outline)}')
     contours = list(outline)
@@ -284,3 +292,93 @@ def _check_simple(loops: list[IntArray], target: FloatArray, n: int) -> None:
             "for the shape, or unevenly spaced: split boundary edges (refine with boundary=True), choose other "
             "corners, or an outline with less detail"
         )
+
+
+# Gap between copies of an outline, relative to the outline's width.
+_GAP = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class FittedProblem:
+    """The mapping problem of a surface.
+
+    ``corner_vertices`` are boundary vertices whose positions the caller chose, or that were assigned to the outline's
+    corners. ``filled_holes`` is the number of holes of the outline that were filled because the surface has no holes.
+    """
+
+    problem: Problem
+    corner_vertices: list[int] = field(default_factory=list)
+    filled_holes: int = 0
+
+
+def fix_in_place(
+    island: Island, fixed: NDArray[np.integer] | None = None, *, reference: Reference | None = None
+) -> FittedProblem:
+    """Fix an island's boundary, or other vertices of its mesh, at their current positions.
+
+    Raise the ValueErrors of `Problem`, and one if there is no boundary to fix or a fixed vertex has no position.
+    """
+    if fixed is None:
+        own = np.unique(boundary_edges(island.F, len(island.vertices)))
+        if not own.size:
+            raise ValueError("the mesh has no boundary to fix: cut it open, or give fixed vertices")
+    else:
+        own = np.flatnonzero(np.isin(island.vertices, fixed))
+    nowhere = own[np.isnan(island.uv[own]).any(axis=1)]
+    if nowhere.size:
+        which = names_of("vertex", "vertices", island.vertices[nowhere])
+        raise ValueError(f"no texture coordinates for the fixed {which}: give every fixed vertex a vt")
+    return FittedProblem(Problem(island.V, island.F, own, island.uv[own], reference=reference))
+
+
+def fit_boundary(
+    V: FloatArray,
+    F: IntArray,
+    contours: Sequence[FloatArray],
+    *,
+    corners: CornerSpec | None = None,
+    corner_angle: float = DEFAULT_CORNER_ANGLE,
+    reference: Reference | None = None,
+    beside: int = 0,
+) -> FittedProblem:
+    """Lay a surface's boundary along an outline; the outline's holes are filled if the surface has none.
+
+    ``contours``, ``corners`` and ``corner_angle`` are those of `boundary_to`. ``beside`` is the index of the outline's
+    copy, from the left; each of several islands has its own. Raises ValueError as `boundary_to` and `Problem`, or if a
+    corner is not on the boundary.
+    """
+    contours = place_beside(contours, beside)
+    without_holes = filled(contours)
+    holes = len(contours) - len(without_holes)
+    try:
+        fills = holes > 0 and len(boundary_loops(F, len(V))) == 1
+    except ValueError:
+        # A mesh without boundary loops is not a valid surface; the error is raised below.
+        fills = False
+    chosen = None if corners is None else corners.on(V, F)
+    onto = without_holes if fills else list(contours)
+    fixed, target = boundary_to(V, F, onto, corners=chosen, corner_angle=corner_angle)
+    marked = find_corner_vertices(fixed, target, onto, corner_angle) if isinstance(chosen, str) else list(chosen or [])
+    problem = Problem(V, F, fixed, target, reference=reference)
+    return FittedProblem(problem, marked, holes if fills else 0)
+
+
+def place_beside(contours: Sequence[FloatArray], beside: int) -> list[FloatArray]:
+    """Return a copy of an outline, the one of index ``beside`` from the left; copies are 5 % of their width apart."""
+    if not beside:
+        return list(contours)
+    right = beside * (1 + _GAP) * float(np.ptp(np.concatenate(contours)[:, 0]))
+    return [contour + np.array([right, 0.0]) for contour in contours]
+
+
+def find_corner_vertices(
+    fixed: IntArray, target: FloatArray, contours: Sequence[FloatArray], angle: float = DEFAULT_CORNER_ANGLE
+) -> list[int]:
+    """Find the boundary vertices at the corners of an outline, in the order of the corners.
+
+    ``fixed`` and ``target`` are results of `boundary_to`. ``angle`` is the minimum turning angle of a corner, in
+    degrees.
+    """
+    sharp = [corners_of(unit, angle) for unit in in_unit(list(contours))[0]]
+    goals = np.concatenate([contour[marks] for contour, marks in zip(contours, sharp, strict=True)])
+    return [int(fixed[(target == goal).all(axis=1)][0]) for goal in goals]

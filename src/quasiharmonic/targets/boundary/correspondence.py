@@ -179,21 +179,25 @@ def max_deviation(contour: FloatArray, along: FloatArray, positions: FloatArray)
 def _match(along: FloatArray, wanted: FloatArray) -> IntArray:
     """Assign a separate vertex to every wanted parameter, in order, minimising the sum of squared distances.
 
-    Both sequences ascend. Row j of ``cost`` has, for every vertex, the lowest cost of the first j + 1 parameters if
-    parameter j takes that vertex.
+    Both sequences ascend. Row j of ``costs`` has, for every vertex in reach, the lowest cost of the first j + 1
+    parameters if parameter j takes that vertex.
     """
-    cost = np.empty((wanted.size, along.size))
+    # A parameter takes its nearest vertex, or the one beside the vertex that the parameter before or after takes. Reach
+    # one vertex further, because the nearest vertex is rounded.
+    rank = np.arange(wanted.size)
+    nearest = np.searchsorted((along[1:] + along[:-1]) / 2, wanted) - rank
+    begin = np.maximum(np.minimum.accumulate(nearest[::-1])[::-1] - 1, 0) + rank
+    end = np.minimum(np.maximum.accumulate(nearest) + 1, along.size - wanted.size) + rank + 1
+    costs: list[FloatArray] = []
     for j, parameter in enumerate(wanted):
-        cost[j] = (along - parameter) ** 2
+        costs.append((along[begin[j] : end[j]] - parameter) ** 2)
         if j:
-            cost[j, 1:] += np.minimum.accumulate(cost[j - 1])[:-1]
-        # The parameters before need at least j vertices.
-        cost[j, :j] = np.inf
-    chosen = np.empty(wanted.size, dtype=np.int64)
-    end = along.size
+            before = np.minimum.accumulate(costs[j - 1])
+            costs[j] += before[np.minimum(np.arange(begin[j], end[j]) - begin[j - 1], before.size) - 1]
+    chosen = np.empty_like(rank)
+    last = along.size
     for j in reversed(range(wanted.size)):
-        end = int(np.argmin(cost[j, :end]))
-        chosen[j] = end
+        chosen[j] = last = begin[j] + np.argmin(costs[j][: last - begin[j]])
     return chosen
 
 

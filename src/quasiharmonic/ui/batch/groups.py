@@ -25,7 +25,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.search.first_stage import SMALL, Patterns, group_by_first_stage, run_first_stage
 from quasiharmonic.solver.search.search import finish_search
-from quasiharmonic.ui.batch import island_problems, memory, metadata, records
+from quasiharmonic.ui.batch import island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.util.arrays import FloatArray, IntArray
@@ -65,7 +65,7 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
     called with ``{"done": k, "outcome": …, "seconds": …}`` when the record of problem ``k`` is written. OutputError if
     a map or a record cannot be written.
     """
-    memory.reset_peak()
+    metadata.reset_peak()
     settings, folders = jobs[0]["settings"], [Path(job["folder"]) for job in jobs]
     read: dict[int, _ReadProblem] = {}
     for k, job in enumerate(jobs):
@@ -91,7 +91,7 @@ def solve_some(jobs: Sequence[Job], tell: Callable[[dict[str, Any]], None]) -> N
             record |= metadata.describe_map(path, "injective", True, bool(certificate.bijective), 0)
             with metadata.time_phase(record, "measure"):
                 record |= metadata.describe_distortion(V, F, uv)
-            record["peak_memory"] = memory.measure_peak()
+            record["peak_memory"] = metadata.measure_peak()
             record["seconds"] = sum(value for name, value in record.items() if name.startswith("seconds_"))
             records.write_record(folders[k], record)
         except FileInUseError:

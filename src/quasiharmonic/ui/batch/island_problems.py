@@ -17,8 +17,8 @@ from quasiharmonic.apps.atlas.seam_cuts import cut_apart
 from quasiharmonic.energies.newton.sliding_boundary import move_onto
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
+from quasiharmonic.targets.boundary.boundary_to import FittedProblem, fit_boundary, fix_in_place
 from quasiharmonic.targets.boundary.corner_pins import CornerSpec, read_corners
-from quasiharmonic.targets.boundary.fitted_problems import FittedProblem, fit_boundary, fix_in_place
 from quasiharmonic.targets.specification import find_sliding_curves
 
 

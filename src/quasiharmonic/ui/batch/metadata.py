@@ -1,4 +1,4 @@
-"""Values of a record that describe one solved problem: sizes, stages, the map, its distortion, times and versions.
+"""Values of a record that describe one solved problem: sizes, stages, the map, its distortion, times, memory, versions.
 
 The functions ``describe_…`` return fields of a record, and `time_phase` adds one. `records.COLUMNS` lists all fields.
 """
@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import json
 import platform
+import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from math import isfinite
@@ -85,3 +86,36 @@ def list_versions() -> str:
     """Return the versions of Python and packages as JSON."""
     packages = {name: version(name) for name in ("numpy", "scipy")}
     return json.dumps({"quasiharmonic": __version__, "python": platform.python_version(), **packages})
+
+
+# Written to /proc/self/clear_refs, this number resets the peak resident memory (VmHWM) of the process; see proc(5).
+_RESET_PEAK = "5"
+
+
+def reset_peak() -> None:
+    """Reset the peak memory of this process, where the system supports it (Linux)."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text(_RESET_PEAK, encoding="utf-8")
+
+
+def measure_peak() -> int | None:
+    """Return the peak resident memory in bytes; None if the system does not report it.
+
+    On Linux it is the peak since `reset_peak`, on other systems since the start of this process.
+    """
+    with suppress(OSError, IndexError):
+        return 1024 * int(Path("/proc/self/status").read_text(encoding="utf-8").split("VmHWM:")[1].split()[0])
+    try:
+        import resource
+    except ImportError:
+        return _measure_peak_on_windows()
+    max_rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return max_rss if sys.platform == "darwin" else 1024 * max_rss
+
+
+def _measure_peak_on_windows() -> int | None:
+    try:
+        import psutil
+    except ImportError:
+        return None
+    return getattr(psutil.Process().memory_info(), "peak_wset", None)

@@ -36,12 +36,12 @@ from quasiharmonic.io.untrusted import use_bound
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.solver.mapping import solve
 from quasiharmonic.solver.refinement import on_refinement
-from quasiharmonic.targets.boundary.fitted_problems import FittedProblem
-from quasiharmonic.ui.batch import groups, island_problems, memory, metadata, records
+from quasiharmonic.targets.boundary.boundary_to import FittedProblem
+from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
-from quasiharmonic.ui.worker_pipes import open_pipes
 from quasiharmonic.util.options import PolishOptions
+from quasiharmonic.util.threads import open_pipes
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"
@@ -105,7 +105,7 @@ def solve_files(job: dict[str, Any], tell: Tell) -> Record:
     """
     folder = Path(job["folder"])
     records.clear(folder)
-    memory.reset_peak()
+    metadata.reset_peak()
     began = time.perf_counter()
     record: Record = {**job["record"], "versions": metadata.list_versions()}
     try:
@@ -120,7 +120,7 @@ def solve_files(job: dict[str, Any], tell: Tell) -> Record:
         # Errors of the input are raised before the sizes are recorded.
         wrong_input = isinstance(error, ValueError) and "vertices" not in record
         record |= {"outcome": "invalid", "error": str(error)} if wrong_input else _describe_error(error)
-    record["peak_memory"] = memory.measure_peak()
+    record["peak_memory"] = metadata.measure_peak()
     record["seconds"] = time.perf_counter() - began
     records.write_record(folder, record)
     return record

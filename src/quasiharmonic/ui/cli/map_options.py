@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from quasiharmonic.io import MeshData
     from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
     from quasiharmonic.problem import Problem
+    from quasiharmonic.targets.boundary.boundary_to import FittedProblem
     from quasiharmonic.targets.boundary.corner_pins import CornerSpec
-    from quasiharmonic.targets.boundary.fitted_problems import FittedProblem
 
 # A copy of the text in quasiharmonic.targets.specification, so that the parser need not import that module.
 FORMS = "disk, ellipse:2x1, rect:2x1, polygon:6, star:5, ring:0.5, letter:G, word:QH, or a file .svg, .txt or .csv"
@@ -179,7 +179,7 @@ def make_problem(
     ``beside`` is the index of the island's own copy of the outline, from the left. ValueError, OSError or
     ModuleNotFoundError if options contradict each other, the mesh or the outline is wrong, or they do not fit together.
     """
-    from quasiharmonic.targets.boundary.fitted_problems import fix_in_place
+    from quasiharmonic.targets.boundary.boundary_to import fix_in_place
 
     if options.to is None:
         posed = IslandProblem(fix_in_place(island, fixed, reference=options.reference))
@@ -196,7 +196,7 @@ def make_problem(
 def _onto_outline(options: argparse.Namespace, island: Island, beside: int) -> IslandProblem:
     """Map the boundary to an outline."""
     from quasiharmonic.targets import outline
-    from quasiharmonic.targets.boundary.fitted_problems import fit_boundary
+    from quasiharmonic.targets.boundary.boundary_to import fit_boundary
 
     try:
         contours = outline(options.to, font=options.font)

@@ -17,9 +17,9 @@ from quasiharmonic.io.registry import find_format
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult
+from quasiharmonic.ui.studio.history import mapped_model, write_model
 from quasiharmonic.ui.studio.page import bundle
 from quasiharmonic.ui.studio.protocol import Array, MessageFrame, ProtocolError, decode, encode
-from quasiharmonic.ui.studio.saved_files import mapped_model, write_model
 from quasiharmonic.ui.studio.session import Session
 from quasiharmonic.ui.studio.surface import PageSurface, make_sheet, read_sheet
 from quasiharmonic.util.arrays import IntArray, describe, index_array

@@ -27,7 +27,7 @@ from quasiharmonic.io.seamed_mesh import Island, SeamedMesh
 from quasiharmonic.problem.diagnosis import diagnose
 from quasiharmonic.problem.result import MapResult, Status, Step
 from quasiharmonic.targets import filled, nearest_on_boundary, outline_curves
-from quasiharmonic.targets.boundary.fitted_problems import find_corner_vertices, place_beside
+from quasiharmonic.targets.boundary.boundary_to import find_corner_vertices, place_beside
 from quasiharmonic.targets.cuts.find import find_cuts
 from quasiharmonic.ui.studio import recipes
 from quasiharmonic.ui.studio.recipes import FIXED, SEAMS, START, Code, Given, Recipe, Script, Source, public

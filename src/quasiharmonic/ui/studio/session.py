@@ -30,15 +30,13 @@ import numpy as np
 from quasiharmonic.io.models.textures import texture_of
 from quasiharmonic.ui.studio import operations, validation
 from quasiharmonic.ui.studio.drag import Follower, drag_weights
-from quasiharmonic.ui.studio.islands import move_islands, pack_all, stitch_seam, weld_seams
+from quasiharmonic.ui.studio.history import list_files
 from quasiharmonic.ui.studio.operations import require_injective, require_map, require_not_mirrored
 from quasiharmonic.ui.studio.protocol import MessageFrame
-from quasiharmonic.ui.studio.saved_files import list_files
-from quasiharmonic.ui.studio.seams import draw_seam, erase_seam
-from quasiharmonic.ui.studio.setup import make_first_state, open_without_map, turn_over
+from quasiharmonic.ui.studio.seams import draw_seam, erase_seam, move_islands, pack_all, stitch_seam, weld_seams
+from quasiharmonic.ui.studio.setup import make_first_state, open_without_map, turn_over, unwrap_model
 from quasiharmonic.ui.studio.state import SessionState
 from quasiharmonic.ui.studio.surface import PageSurface, make_first_sheet, read_upload
-from quasiharmonic.ui.studio.unwrapping import unwrap_model
 from quasiharmonic.ui.studio.updates import DragState, PageUpdates
 from quasiharmonic.ui.studio.validation import Outline, RequestError, make_outline, make_polygon, read_drawing
 from quasiharmonic.util.options import ENERGIES

@@ -212,6 +212,8 @@ def _unwrap(options: argparse.Namespace, mesh: MeshData, began: float) -> pipeli
             "seconds": time.perf_counter() - began,
         }
         lines = [f"wrote {options.output}: {result.message}", result.summary(), *_cleaning(result)]
+        if options.stack == "mirrored" and not result.symmetry.applied:
+            lines.append("--stack mirrored has no effect: seams and charts are not mirrored, see --symmetry")
         if densities := material_densities(mesh, result):
             facts["material_texels_per_unit"] = densities
             shown = ", ".join(f"{printable_path(name)} {density:.4g}" for name, density in densities.items())
