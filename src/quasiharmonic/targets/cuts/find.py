@@ -38,7 +38,7 @@ from quasiharmonic.util.arrays import (
 _LARGE, _COARSE = 5_000, 4_000
 # A surface with more vertices is cut on a mesh with this share of them, smoothed by this number of sweeps, if its cuts
 # are found on a coarser mesh in turn.
-_HUGE, _SHARE, _SWEEPS = 160_000, 1 / 8, 3
+_HUGE, _SHARE, _SWEEPS = 80_000, 1 / 8, 3
 # The seams of coarse charts are shortened on every third mesh only: where they stay, the charts keep their maps.
 _EVERY = 3
 # `crease_costs` saves this share of the cost where the surface bends inwards by this angle or more.
