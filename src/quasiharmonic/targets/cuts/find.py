@@ -38,7 +38,9 @@ from quasiharmonic.util.arrays import (
 _LARGE, _COARSE = 5_000, 4_000
 # A surface with more vertices is cut on a mesh with this share of them, smoothed by this number of sweeps, if its cuts
 # are found on a coarser mesh in turn.
-_HUGE, _SHARE, _SWEEPS = 160_000, 1 / 8, 3
+_HUGE, _SHARE, _SWEEPS = 80_000, 1 / 8, 3
+# The seams of coarse charts are shortened on every third mesh only: where they stay, the charts keep their maps.
+_EVERY = 3
 # `crease_costs` saves this share of the cost where the surface bends inwards by this angle or more.
 _SAVED, _CONCAVE = 0.75, np.pi / 3
 # Rings of triangles by which cuts may move on each finer mesh. Longer moves would shorten cuts at the expense of
@@ -164,7 +166,8 @@ def find_cuts_by(
 
             huge = find_coarse is not None and vertices.size > _HUGE
             goal, sweeps = (int(_SHARE * vertices.size), _SWEEPS) if huge else (_COARSE, 0)
-            cut = cut_by_levels(V[names], T, own, find, rings, goal=goal, sweeps=sweeps)
+            every = 1 if find_coarse is None else _EVERY
+            cut = cut_by_levels(V[names], T, own, find, rings, goal=goal, sweeps=sweeps, every=every)
         else:
             graph = edge_graph(V[names], T, own)
             cut = graph.ends[_cut_part(graph, min_gain)]

@@ -8,8 +8,8 @@ from there to the other cuts.
 On large surfaces only paths close to the stretch are considered. Each end of such a path must lie on cuts that are
 connected to the stretch's own end nearby, so both ends are on different borders of the ring.
 
-`cut_by_levels` finds cuts of a large surface on a coarse mesh, carries them to the fine one, and shortens them at every
-level. A coarse mesh results from removing vertices one after another (`geometry.coarsening`). Inserting a vertex again
+`cut_by_levels` finds cuts of a large surface on a coarse mesh, carries them to the fine one, and shortens them on the
+way. A coarse mesh results from removing vertices one after another (`geometry.coarsening`). Inserting a vertex again
 splits the edges of its fan, which all start at the fan's apex. A cut along such an edge becomes a cut from the apex to
 the vertex and on to the edge's other end. So cuts keep their topology, and paths need to move by few edges only.
 """
@@ -284,6 +284,7 @@ def cut_by_levels(
     *,
     goal: int,
     sweeps: int = 0,
+    every: int = 1,
 ) -> IntArray:
     """Cut a large connected surface.
 
@@ -303,6 +304,8 @@ def cut_by_levels(
         Number of vertices of the coarse mesh.
     sweeps : int
         Number of times that the coarse mesh is smoothed. Means of few positions make it rough.
+    every : int
+        Cuts are shortened on the surface and on each ``every``-th coarser mesh; each of these halves the vertices.
 
     Returns
     -------
@@ -320,9 +323,10 @@ def cut_by_levels(
     cut = vertices[graph.ends[find(graph, vertices, coarsening.rounds)]]
     if not cut.size:
         return cut
+    levels = sorted(coarsening.levels)[::every]
     for k in reversed(range(len(coarsening.rounds))):
         cut = insert_vertices(cut, coarsening.rounds[k], n)
-        if k in coarsening.levels:
+        if k in levels:
             heartbeat()
             T = coarsening.levels[k]
             near = triangles_near(T, mark(n, cut), rings)
