@@ -76,11 +76,64 @@ def test_a_mirrored_mesh_faces_outwards_and_its_triangles_stay_in_the_file(tmp_p
     np.testing.assert_array_equal(again.corner_uv.ravel(), np.arange(2.0 * F.size))
 
 
-@pytest.mark.parametrize(("scale", "size"), [([0, 0, 0], 1), ([0, 0, 3], 1), ([3, 3, 0], 3)])
-def test_a_mesh_that_its_node_collapses_keeps_its_own_size(tmp_path, scale, size):
-    made = place(square(), {"mesh": 0, "scale": scale, "translation": [5, 0, 0]})
+def flat_cat(node):
+    """A curved mesh below a node of scale 0.5."""
+    V, F = cat(4)
+    made = Gltf()
+    made.mesh(
+        {"attributes": {"POSITION": made.accessor(V.astype("f4"))}, "indices": made.accessor(F.ravel().astype("u2"))}
+    )
+    made.tree |= {"nodes": [{"children": [1], "scale": [0.5, 0.5, 0.5]}, {"mesh": 0, **node}]}
+    made.tree["scenes"] = [{"nodes": [0]}]
+    return made, V.astype("f4"), F
+
+
+@pytest.mark.parametrize(
+    ("node", "size"),
+    [
+        ({"scale": [0, 0, 0]}, [1, 1, 1]),
+        ({"scale": [0, 0, 3]}, [3, 3, 3]),
+        ({"scale": [3, 3, 0]}, [3, 3, 3]),
+        ({"scale": [0, 2, 3]}, [3, 2, 3]),
+        ({"scale": [1, 0, -1]}, [1, -1, -1]),
+        ({"matrix": [0, 2, 0, 0, -3, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1]}, [3, 2, 3]),
+    ],
+)
+def test_scales_of_zero_are_replaced_by_the_largest_and_those_of_parents_stay(tmp_path, node, size):
+    made, V, F = flat_cat(node)
     mesh = read(made, tmp_path / "in.glb")
-    np.testing.assert_array_equal(mesh.V, size * SQUARE + np.array([5, 0, 0]))
+    if "matrix" in node:  # A rotation by 90 degrees, and scales of 2 and 3.
+        V, size = V[:, [1, 0, 2]], [-3, 2, 3]
+    np.testing.assert_allclose(mesh.V, 0.5 * V * np.array(size), atol=1e-12)
+    np.testing.assert_array_equal(mesh.F, F)
+
+
+def test_of_equal_occurrences_one_that_is_not_mirrored_counts(tmp_path):
+    nodes = [{"mesh": 0, "scale": scale} for scale in ([-1, 1, 1], [1, 1, 1], [1, -1, 1], [0, 5, 5])]
+    np.testing.assert_array_equal(read(place(square(), *nodes), tmp_path / "in.glb").V, SQUARE)
+    nodes[2]["scale"] = [1, -1, 1.01]
+    np.testing.assert_array_equal(read(place(square(), *nodes), tmp_path / "in.glb").V, SQUARE * [1, -1, 1])
+
+
+def test_infinite_numbers_of_nodes_are_named(tmp_path):
+    made = place(square(), {"mesh": 0, "scale": [777777, 1, 1]})
+    (tmp_path / "in.gltf").write_bytes(made.gltf().replace(b"777777", b"1e999"))
+    with pytest.raises(MeshFileError, match=r"scale of node 0 must have 3 numbers, not \[inf, 1, 1\]$"):
+        io.read_gltf(tmp_path / "in.gltf")
+
+
+def test_the_least_integer_of_normals_is_reversed(tmp_path):
+    made = square()
+    (primitive,) = made.tree["meshes"][0]["primitives"]
+    normals = np.array([[0, 0, -128], [0, 0, -127], [0, 0, 127], [0, 90, -90]], "i1")
+    primitive["attributes"]["NORMAL"] = made.accessor(normals, normalized=True)
+    mesh = read(made, tmp_path / "in.glb")
+    write_cut(tmp_path / "out.glb", mesh.turn_over())
+    before, after = (
+        np.array([line.split()[1:] for line in one.normals.splitlines()], float)
+        for one in (mesh, io.read_gltf(tmp_path / "out.glb"))
+    )
+    np.testing.assert_array_equal(after[:4], -before)
 
 
 def test_instances_of_an_extension_in_a_lightmap_are_reported(tmp_path, capsys):

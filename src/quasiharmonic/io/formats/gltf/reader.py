@@ -26,6 +26,8 @@ PLACES = "TEXCOORD_0"
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # Volumes with a smaller ratio are equal, up to rounding.
 _LARGER = 1 + 1e-9
+# A scale of 0 up to rounding, as a fraction of the largest.
+_NO_SCALE = 1e-12
 _READ = "POSITION", "NORMAL", "COLOR_0", PLACES
 # Memory to read a triangle or a vertex, roughly.
 _BYTES_TO_READ = 200
@@ -364,37 +366,54 @@ def _separate_instances(tree: dict[str, Any]) -> None:
 def _placements(tree: dict[str, Any]) -> dict[int, FloatArray]:
     """Return the transformation (4, 4) of each mesh in the scene, without identities.
 
-    Of several nodes, the one at which the mesh is largest counts, so that its texel density suffices for all. A mesh
-    that a scale of 0 collapses, often at the start of an animation, keeps its own size.
+    Of several nodes, the one at which the mesh is largest counts, so that its texel density suffices for all. Nodes
+    that a scale of 0 collapses, often at the start of an animation, count last.
     """
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes", [])
     roots = scenes[whole(tree.get("scene", 0))].get("nodes", []) if scenes else []
-    waiting = [(whole(root), np.eye(4)) for root in reversed(roots)]
-    placed: dict[int, FloatArray] = {}
+    waiting = [(whole(root), np.eye(4), False) for root in reversed(roots)]
+    placed: dict[int, tuple[float, FloatArray]] = {}
     seen = set()
     while waiting:
-        index, above = waiting.pop()
+        index, above, collapsed = waiting.pop()
         if index in seen:
             continue
         seen.add(index)
         node = nodes[index]
-        here = above @ _local_matrix(node, index)
+        local, has_zero = _restore_scales(_local_matrix(node, index))
+        here, collapsed = above @ local, collapsed or has_zero
         if "mesh" in node:
             # The transformation of a node with a skin is ignored, as glTF specifies.
             matrix, mesh = np.eye(4) if "skin" in node else here, whole(node["mesh"])
-            if mesh not in placed or _volume(matrix) > _LARGER * _volume(placed[mesh]):
-                placed[mesh] = matrix
-        waiting += [(whole(child), here) for child in reversed(node.get("children", []))]
-    for matrix in placed.values():
-        if not _volume(matrix) and not _cofactors(matrix).any():
-            matrix[:3, :3] = np.eye(3)
-    return {mesh: matrix for mesh, matrix in placed.items() if not np.array_equal(matrix, np.eye(4))}
+            size = 0.0 if collapsed and "skin" not in node else compare_size(matrix)
+            if mesh not in placed or size > _LARGER * placed[mesh][0]:
+                placed[mesh] = size, matrix
+        waiting += [(whole(child), here, collapsed) for child in reversed(node.get("children", []))]
+    return {mesh: matrix for mesh, (_, matrix) in placed.items() if not np.array_equal(matrix, np.eye(4))}
 
 
-def _volume(matrix: FloatArray) -> float:
-    """Return the factor on volumes of a transformation (4, 4)."""
-    return abs(float(np.linalg.det(matrix[:3, :3])))
+def compare_size(matrix: FloatArray) -> float:
+    """Return a number to compare occurrences of a mesh by their transformations: the factor on volumes.
+
+    Of two occurrences of equal size, one that is not a reflection has the larger number.
+    """
+    volume = float(np.linalg.det(matrix[:3, :3]))
+    return volume * _LARGER**2 if volume > 0 else -volume
+
+
+def _restore_scales(matrix: FloatArray) -> tuple[FloatArray, bool]:
+    """Return a matrix (4, 4) with its largest scale, or 1, in place of scales of 0; and whether there were any."""
+    left, scales, right = np.linalg.svd(matrix[:3, :3])
+    zero = scales <= _NO_SCALE * scales[0]
+    if not zero.any():
+        return matrix, False
+    scales[zero] = scales[0] or 1.0
+    # Do not mirror the mesh.
+    left[:, 2] *= np.sign(np.linalg.det(left @ right))
+    restored = matrix.copy()
+    restored[:3, :3] = left * scales @ right
+    return restored, True
 
 
 def _local_matrix(node: dict[str, Any], index: int) -> FloatArray:
@@ -417,7 +436,11 @@ def _numbers(node: dict[str, Any], name: str, default: list[int], index: int) ->
     """The numbers of a node's entry, as many as its default has; `ValueError` for anything else."""
     values = node.get(name, default)
     is_list = isinstance(values, list)
-    if not is_list or len(values) != len(default) or not all(isinstance(value, int | float) for value in values):
+    if (
+        not is_list
+        or len(values) != len(default)
+        or not all(isinstance(value, int | float) and abs(value) < np.inf for value in values)
+    ):
         found = f"{len(values)}" if is_list and len(values) != len(default) else ascii(values)[:40]
         raise ValueError(f"{name} of node {index} must have {len(default)} numbers, not {found}")
     return np.array(values, dtype=np.float64)

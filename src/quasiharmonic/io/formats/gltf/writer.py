@@ -202,7 +202,9 @@ def _extend(
     for holders, entries in shared:
         for name, accessor in entries:
             table = document.numbers(accessor)[origin]
-            table = -table if turned and name == "NORMAL" else table
+            if turned and name == "NORMAL":
+                # The least integer has no opposite: subtract 1 from its negative, which is itself.
+                table = -table - ((table < 0) & (-table < 0))
             _set_numbers(document, holders, name, table, users, repeated=True)
 
 
