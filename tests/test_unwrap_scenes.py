@@ -98,8 +98,8 @@ def test_transformations_of_a_scene_scale_the_density(instances):
     places = [MIRROR, SQUEEZE] if instances == "share" else [np.eye(4), MIRROR, SQUEEZE]
     for part, place in zip(result.parts, places, strict=True):
         expected = density**2 * model_areas(part.V @ place[:3, :3].T, part.vmapping[part.indices])
-        # Positive areas: charts of reflected meshes are not mirrored.
-        np.testing.assert_allclose(texel_areas(part), expected, rtol=1e-3)
+        # Charts are not mirrored in the scene, where a reflection reverses triangles.
+        np.testing.assert_allclose(texel_areas(part) * np.sign(np.linalg.det(place)), expected, rtol=1e-3)
         assert part.texels_per_unit == pytest.approx(density * abs(np.linalg.det(place[:3, :3])) ** (1 / 3))
 
 
@@ -278,6 +278,24 @@ def test_other_formats_name_the_occurrences_that_they_lose(tmp_path):
     assert "1 further occurrence of meshes in the scene" in io.not_held(tmp_path / "out.obj", mesh)
     assert "1 further occurrence of meshes in the scene" in io.not_held(tmp_path / "out.ply", mesh)
     assert not io.not_held(tmp_path / "out.glb", mesh)
+
+
+def test_of_equal_nodes_one_that_is_not_mirrored_counts():
+    scene = trimesh.Scene()
+    scene.add_geometry(make_mesh(TUBE), node_name="left", geom_name="tube", transform=np.diag([-1.0, 1, 1, 1]))
+    scene.graph.update(frame_to="right", geometry="tube", matrix=np.eye(4))
+    assert (texel_areas(unwrap(scene, resolution=256).parts[0]) > 0).all()
+
+
+def test_given_coordinates_of_corners_belong_to_the_corners_of_the_meshes():
+    scene = trimesh.Scene()
+    scene.add_geometry(make_mesh(TUBE), transform=np.diag([-1.0, 1, 1, 1]))
+    (part,) = unwrap(scene, resolution=256).parts
+    corners = part.uvs[part.indices]
+    (again,) = unwrap(scene, uv=corners, resolution=256).parts
+    np.testing.assert_array_equal(again.charts, part.charts)
+    lengths = [np.linalg.norm(uv - np.roll(uv, 1, axis=1), axis=2) for uv in (corners, again.uvs[again.indices])]
+    np.testing.assert_allclose(*lengths, rtol=0.1)
 
 
 def test_each_part_has_its_inverse():

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.inverse_map import ChartInverse
+from quasiharmonic.apps.unwrapping.cleaning import turn_corners
 from quasiharmonic.apps.unwrapping.model_files import label_statements
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.io.accepts_mesh import AcceptsMesh
+from quasiharmonic.io.formats.gltf.reader import compare_size
 from quasiharmonic.io.mesh_files import read_mesh
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.objects import MeshLike, make_trimesh, mesh_arrays, stands_for_mesh
@@ -107,6 +109,7 @@ class SceneResult(OutcomeOf):
         One for each mesh, in the order of the list or of the scene; with ``instances="own"``, one for each node.
     atlas : UnwrapResult
         All meshes as one, transformed and weighted: vertices and triangles of one mesh after those of another.
+        Triangles of mirrored nodes are reversed.
     source : object
         The list or the scene that was given.
     """
@@ -168,6 +171,11 @@ class _Placed:
     def scale(self) -> float:
         """Factor on lengths, the geometric mean over all directions."""
         return float(self.weight * np.abs(np.linalg.det(self.matrix)) ** (1 / 3))
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the transformation is a reflection, which reverses triangles."""
+        return bool(np.linalg.det(self.matrix) < 0)
 
 
 class AcceptsScene(Protocol[P]):
@@ -241,21 +249,27 @@ def _unwrap_scene(
         _place_scene(scene, instances, weights) if _is_scene(scene) else _place_list(scene, instances, weights)
     )
     meshes = [_read(one) for one in placed]
-    points = [_move(one, V) for one, (V, _) in zip(placed, meshes, strict=True)]
+    points = [
+        (pad_to_space(V) @ one.matrix.T + one.shift) * one.weight for one, (V, _) in zip(placed, meshes, strict=True)
+    ]
     vertices, triangles = [len(V) for V, _ in meshes], [len(F) for _, F in meshes]
     if isinstance(options.get("tile_by"), str):
         options["tile_by"] = _number_materials([one.source for one in placed], triangles)
     first, begin = np.cumsum([0, *vertices]), np.cumsum([0, *triangles])
+    turned = repeat_each([one.is_mirrored for one in placed], triangles)
+    if np.shape(options.get("uv", ())) == (*turned.shape, 3, 2):
+        options["uv"] = turn_corners(np.asarray(options["uv"]), turned)
+    corners = np.concatenate([F + start for (_, F), start in zip(meshes, first, strict=False)])
     atlas = unwrap(
         np.concatenate(points),
-        np.concatenate([F + start for (_, F), start in zip(meshes, first, strict=False)]),
+        turn_corners(corners, turned),
         meshes=repeat_each(np.arange(len(placed)), vertices),
         **options,
     )
-    parts = []
+    parts, rows_in_atlas = [], turn_corners(atlas.indices, turned)
     for k, (one, (V, F)) in enumerate(zip(placed, meshes, strict=True)):
         faces = slice(begin[k], begin[k] + len(F))
-        rows, indices = np.unique(atlas.indices[faces], return_inverse=True)
+        rows, indices = np.unique(rows_in_atlas[faces], return_inverse=True)
         excluded = atlas.cleaned.excluded
         parts.append(
             ScenePart(
@@ -333,7 +347,7 @@ def _place_scene(scene: Any, instances: str, weights: Any) -> tuple[list[_Placed
             own = node if instances == "own" and len(nodes[name]) > 1 else None
             here.append(_Placed(name, own, mesh, matrix[:3, :3], matrix[:3, 3], weights.get(name, 1.0)))
         # Nodes that share texture coordinates have the density of the largest.
-        placed += here if instances == "own" else [max(here, key=lambda one: one.scale)]
+        placed += here if instances == "own" else [max(here, key=lambda one: compare_size(one.matrix))]
     if not placed:
         raise ValueError("the scene has no meshes: add one with triangles")
     return placed, [(one.name, k) for k, one in enumerate(placed)]
@@ -348,11 +362,3 @@ def _read(one: _Placed) -> tuple[FloatArray, IntArray]:
         return V, triangle_array(F, len(V))
     except ValueError as error:
         raise ValueError(f"mesh {one.name}: {error}") from error
-
-
-def _move(one: _Placed, V: FloatArray) -> FloatArray:
-    """Return the positions (n, 3) at which a mesh is unwrapped: without reflection, so that no chart is mirrored."""
-    points: FloatArray = (pad_to_space(V) @ one.matrix.T + one.shift) * one.weight
-    if np.linalg.det(one.matrix) < 0:
-        points[:, 0] = points[:, 0].min() + points[:, 0].max() - points[:, 0]
-    return points
