@@ -63,6 +63,16 @@ def test_a_material_that_no_library_in_the_folder_has_is_listed(tmp_path, librar
     assert bake(old, old, size=4).problems == ("material m is in no material library in the folder of the file",)
 
 
+@pytest.mark.parametrize("line", ['"c d.mtl"', 'n.mtl "c d.mtl"', '"c d.mtl" n.mtl', "c d.mtl"])
+def test_names_of_libraries_may_have_blanks_and_quotes(tmp_path, line):
+    (tmp_path / "c d.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    (tmp_path / "a.obj").write_text(f"mtllib {line}\n{SQUARE}")
+    old = io.read_mesh(tmp_path / "a.obj")
+    result = bake(old, old, size=4)
+    assert result.problems == ()
+    assert (result.colour[..., :3] == [255, 0, 0]).all()
+
+
 def test_an_image_is_repeated_and_shifted(tmp_path):
     old = with_material(tmp_path, "map_Kd -s 2 1 -o 0 0.5 t.png", "t.png")
     result = bake(old, old, size=(8, 4))

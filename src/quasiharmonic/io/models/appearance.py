@@ -7,6 +7,7 @@ lines of the mesh and libraries (.mtl) that these lines name.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -157,12 +158,14 @@ def with_libraries(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
 def library_names(line: bytes, *folders: Path) -> list[str]:
     """Return the names in an ``mtllib`` line: several names, or one with blanks if it is a file of one of the folders.
 
-    The list is empty for other lines.
+    Names with blanks may have quotes. The list is empty for other lines.
     """
     if not _names_library(line):
         return []
     name = os.fsdecode(b"".join(line.split(None, 1)[1:]).strip())
-    return [name] if any((folder / name).is_file() for folder in folders) else name.split()
+    if any((folder / name).is_file() for folder in folders):
+        return [name]
+    return [quoted or plain for quoted, plain in re.findall(r'"([^"]+)"|(\S+)', name)]
 
 
 def companions(path: str | os.PathLike[str], texture: Texture) -> tuple[Path, Path]:
