@@ -254,6 +254,7 @@ def test_sample_grid_includes_the_sides():
     u, v, at = inverse.sample_grid(3, 3, box=(-0.5, 0.0, 0.5, 1.0))
     assert u.tolist() == [-0.5, 0.0, 0.5]
     assert at.found.tolist() == [[False] * 3, [True] * 3, [True] * 3]
+    assert inverse.sample_grid(3, 3, box=(-1e308, 0, 1e308, 1))[0].tolist() == [-1e308, 0, 1e308]
 
 
 def random_square(seed=3):

@@ -186,6 +186,11 @@ def test_invalid_boundary_curves(rails, message):
         polish(V, F, uv, fixed=loop, slide=rails(loop))
 
 
+def test_a_target_beyond_all_walls_is_impossible_without_a_warning():
+    V, F, _, body, _ = channel(4)
+    assert morph(V, F, body, 1e300 * V[body], slide=True).status is Status.IMPOSSIBLE
+
+
 def test_violated_order():
     V, _, _, loop = sheared()
     lower = np.flatnonzero(V[:, 1] == 0)

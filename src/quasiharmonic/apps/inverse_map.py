@@ -359,7 +359,9 @@ class InverseMap(ReadOnly):
         ends = real_array("box", box)
         if ends.shape != (4,) or not np.isfinite(ends).all() or (ends[:2] > ends[2:]).any():
             raise ValueError(f"box must be finite: minimum u and v, then maximum u and v, not {box}")
-        u, v = np.linspace(ends[0], ends[2], columns), np.linspace(ends[1], ends[3], rows)
+        # The extent of a box may overflow, that of half the box does not.
+        low, high = ends[:2] / 2, ends[2:] / 2
+        u, v = 2 * np.linspace(low[0], high[0], columns), 2 * np.linspace(low[1], high[1], rows)
         return u, v, self.locate(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1))
 
     @cached_property

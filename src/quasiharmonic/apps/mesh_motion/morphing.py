@@ -289,7 +289,8 @@ def make_way(
 def _find_shifts(chain: Chain, there: FloatArray, is_moved: BoolArray, near: float) -> FloatArray:
     """Lengths (k,) by which the nodes of a chain move along their curve; zero for those that leave it."""
     curve = chain.curve
-    where, distance = curve.nearest(there[chain.vertices])
+    with np.errstate(over="ignore"):
+        where, distance = curve.nearest(there[chain.vertices])
     shift = where - chain.s
     if curve.closed:
         shift -= curve.length * np.round(shift / curve.length)
