@@ -16,6 +16,7 @@ from quasiharmonic import (
     distortion,
     flatten,
     inverted_triangles,
+    io,
     is_injective,
     polish,
     refine,
@@ -188,6 +189,8 @@ def test_masked_elements_are_rejected():
     for wrong in ((np.ma.masked_equal(F, 3), UV), (F, np.ma.masked_less(UV, 0))):
         with pytest.raises(ValueError, match=r"has masked elements: fill them or leave them out$"):
             certify(*wrong)
+    with pytest.raises(ValueError, match="extra has masked elements"):
+        io.MeshData(V, F, extra=np.ma.masked_less(V, 0.5))
 
 
 def test_invalid_frames():

@@ -22,6 +22,7 @@ from quasiharmonic.util.arrays import (
     corner_rows,
     map_array,
     pad_to_space,
+    real_array,
     repeat_each,
     triangle_rows,
     vertex_array,
@@ -151,6 +152,8 @@ class MeshData:
             object.__setattr__(self, "vt", vt)
         if self.FT is not None:
             object.__setattr__(self, "FT", corner_rows("FT", self.FT, F, 0 if self.vt is None else len(self.vt)))
+        if self.extra is not None:
+            object.__setattr__(self, "extra", real_array("extra", self.extra))
         if self.FN is not None:
             object.__setattr__(self, "FN", corner_rows("FN", self.FN, F, self.normals.count(b"\n")))
 
