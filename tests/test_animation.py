@@ -260,7 +260,7 @@ def test_interrupted_with_the_finished_frames(head, sweep):
     assert len(animation.frames) == (6 if sweep == 0 else 12)
     assert animation.found.all()
     assert animation.interrupted
-    missing = ("the last frame", "the moves between frames were limited")[sweep]
+    missing = ("the polish of frames 0, 1, 2, 3, 4, … (6 in all)", "the moves between frames were limited")[sweep]
     assert f"interrupted before {missing}" in animation.summary()
     over = animation.largest_move > 1.2
     assert ("beyond the limit of 1.2" in animation.summary()) == over
@@ -288,6 +288,7 @@ def test_the_command(head, tmp_path, capsys):
     surface = tmp_path / "head.obj"
     io.write_obj(surface, io.MeshData(V, F))
     (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "._f8.obj").write_bytes(b"")
     for t, uv in enumerate(animation.uv):
         io.write_obj(tmp_path / "in" / f"f{t + 8}.obj", io.MeshData(V, F).with_map(uv))
     np.save(tmp_path / "frames.npy", animation.uv)

@@ -204,6 +204,14 @@ class TestCut:
         assert "nothing to cut" in capsys.readouterr().out
         assert run("flatten", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--cut") == 0
 
+    def test_given_edges_count_as_cuts(self, tmp_path, capsys):
+        V, F = grid(6, 6)
+        io.write_obj(tmp_path / "in.obj", io.MeshData(lift(V), F))
+        (tmp_path / "edges.txt").write_text("0 8")
+        call = "map", tmp_path / "in.obj", "-o", tmp_path / "out.obj", "--to", "disk", "--seams", tmp_path / "edges.txt"
+        assert run(*call, "--cut") == 0
+        assert "cut along 1 edge:" in capsys.readouterr().out
+
     def test_cuts_run_along_edges_of_quads(self, tmp_path):
         write_cube(tmp_path / "in.obj", 4)
         out = tmp_path / "out.obj"

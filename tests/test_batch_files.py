@@ -10,6 +10,7 @@ import tarfile
 import pytest
 
 from quasiharmonic import batch
+from quasiharmonic.ui.batch.readers import find_archives
 from quasiharmonic.ui.batch.samples import read_samples
 
 FORMS = [tarfile.PAX_FORMAT, tarfile.GNU_FORMAT]
@@ -46,6 +47,15 @@ def test_links_in_tar_archives_are_reported(tmp_path, form, first):
         "h/e": None,
         "h/b (2)": "the name h/b is used twice in the archive",
     }
+
+
+def test_hidden_files_are_no_problems(tmp_path):
+    """Archives made on macOS have a file ``._a.obj`` before ``a.obj``."""
+    files = [(f"h/{name}", tarfile.REGTYPE) for name in ("._a.obj", "a.obj", "._a.txt", "a.txt")]
+    (found,) = read_samples(write_tar(tmp_path / "h.tar", files))
+    assert (found.key, found.mesh, found.fixed, found.error) == ("h/a", "obj", "txt", None)
+    write_tar(tmp_path / "._h.tar", files)
+    assert [one.name for one in find_archives(tmp_path, plain=True)] == ["h.tar"]
 
 
 def test_surfaces_of_freesurfer_are_found(tmp_path):

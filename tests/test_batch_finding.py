@@ -59,6 +59,7 @@ class TestFinding:
 
     def test_plain_meshes(self, stars):
         (stars / "b" / "other.OFF").write_text("")
+        (stars / "b" / "._other.OFF").write_text("")
         assert names(stars, plain=True) == [
             "a/input.obj", "b/c/input.obj", "b/d/e/input.obj", "b/other.OFF", "z/input.obj",
         ]  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -72,6 +74,21 @@ def test_advice_on_a_soup_names_the_option(capsys, tmp_path):
 def test_a_folder_that_is_missing(capsys, tmp_path):
     assert main(["animate", str(tmp_path / "a.obj"), str(tmp_path / "frames"), "-o", str(tmp_path / "b.gif")]) == 2
     assert capsys.readouterr().err == f"qhm animate: {tmp_path / 'frames'}: there is no such file or folder\n"
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("check x.geo", r"\.geo files cannot be read; supported: \.obj, .*\.mesh\n"),
+        ("measure x.geo", r"\.geo files cannot be read; supported: \.obj, .*\.mesh\n"),
+        ("plot x.geo -o p.png", r"\.geo files cannot be read; supported: \.obj, .*\.mesh, \.npy, .*"),
+        ("measure .", "is a folder, not a file; supported: .*"),
+    ],
+)
+def test_files_of_no_format(capsys, tmp_path, monkeypatch, call, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(call.split()) == 2
+    assert re.search(f": {message}", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -117,7 +118,8 @@ class TestReportFailures:
         io.write_obj(tmp_path / "two.obj", two.with_map(two.V[:, :2]))
         call = "map", tmp_path / "two.obj", "--to", "disk", "--islands", "1", "-o", tmp_path / "o.obj"
         for more in ((), ("--refine",), ("--kind", "distortion")):
-            assert run(*call, "--plot", tmp_path / "p.png", *more) == 0
+            assert run(*call, "--plot", tmp_path / "p.png", *more, "--json", tmp_path / "r.json") == 0
+            assert json.loads((tmp_path / "r.json").read_text())["linear_solver"]
 
     @pytest.mark.slow
     def test_no_first_map_to_draw(self, star, tmp_path, monkeypatch):

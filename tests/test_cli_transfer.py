@@ -58,6 +58,19 @@ def test_linear_data_are_transferred_exactly(files, capsys):
     assert np.isin(np.load("t_out.npy"), np.arange(len(F))).all()
 
 
+def test_several_files_are_transferred(files, capsys):
+    a, _, b, _ = files
+    np.savetxt("v.txt", height(a))
+    np.savetxt("m.txt", [1], fmt="%d")
+    twice = "--values v.txt 1.npy --values v.txt 2.csv --landmarks m.txt m1.csv --landmarks m.txt m2.csv"
+    assert main(f"transfer a.obj b.obj {twice}".split()) == 0
+    np.testing.assert_allclose(np.load("1.npy"), height(b), atol=1e-14)
+    np.testing.assert_array_equal(np.loadtxt("2.csv"), np.load("1.npy"))
+    assert np.loadtxt("m1.csv", delimiter=",", skiprows=1)[0] == np.loadtxt("m2.csv", delimiter=",", skiprows=1)[0] == 1
+    assert main(["transfer", "a.obj", "b.obj", "--values", "v.txt", "3.npy", "--values", "v.txt", "3.npy"]) == 2
+    assert "--values (2) 3.npy is also the file of --values" in capsys.readouterr().err
+
+
 def test_seams_and_unused_vertices(files):
     a, F, b, _ = files
     # The left half of the source is shifted in the plane, and the target's last vertex belongs to no triangle.

@@ -314,7 +314,7 @@ def test_specifications_of_corners_are_read(text, entries):
 
 
 def test_specifications_in_a_file(tmp_path):
-    (tmp_path / "c.txt").write_text("# corners\nnear:0, 1, 2 3\n\n4 0\nnear:0,1,5:1\n9:2 # the last\n")
+    (tmp_path / "c.txt").write_text("\ufeff# corners\nnear:0, 1, 2 3\n\n4 0\nnear:0,1,5:1\n9:2 # the last\n")
     assert read_corners(str(tmp_path / "c.txt")).entries == (((0, 1, 2), 3), (4, 0), ((0, 1, 5), 1), (9, 2))
     (tmp_path / "c.txt").write_text("# none\n")
     with pytest.raises(ValueError, match="the file names no corners"):

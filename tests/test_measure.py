@@ -166,6 +166,12 @@ def test_invalid_outputs(stretched, tmp_path, monkeypatch, capsys, arguments, me
     assert [file.name for file in tmp_path.iterdir()] == ["map.obj"]
 
 
+def test_flat_triangles_of_opposite_orientation(tmp_path, capsys):
+    io.write_obj(tmp_path / "flip.obj", io.MeshData([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 3, 2]]))
+    assert main(["measure", str(tmp_path / "flip.obj")]) == 0
+    assert "mirrored island 1 measured with reversed orientation" in capsys.readouterr().out
+
+
 @pytest.mark.long
 def test_vertices_without_a_triangle_have_no_position(stretched, tmp_path):
     path, V, F, uv = stretched

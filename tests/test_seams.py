@@ -163,6 +163,13 @@ class TestRows:
             assert np.array_equal(island.uv, shifted[k])
         assert np.isfinite(placed.uv).all()
 
+    def test_islands_that_share_a_vertex_have_their_own_rows(self):
+        mesh = SeamedMesh([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]], [[0, 1, 2], [0, 3, 4]])
+        shifted = [mesh.V[island.vertices] + [10 * k, 0] for k, island in enumerate(mesh.islands)]
+        placed = mesh.with_places(shifted)
+        assert placed.FT.tolist() == [[0, 1, 2], [5, 3, 4]]
+        assert np.array_equal(placed.uv[placed.FT], np.stack(shifted))
+
     def test_vertices_of_no_triangle_get_no_row(self):
         V, F = grid(2, 2)
         mesh = SeamedMesh(np.vstack([V, [[9.0, 9.0]]]), F)

@@ -207,7 +207,9 @@ def find_format(path: FilePath, *needs: Feature) -> Format:
     lacking = [need for need in needs if form is None or not getattr(form, need)]
     if form is None or lacking:
         fault = f"{suffix} files {_FAULTS[lacking[0]]}" if suffix else "has no suffix, so its format is unknown"
-        if not suffix and "read" in needs and not os.path.exists(path):
+        if os.path.isdir(path):
+            fault = "is a folder, not a file"
+        elif not suffix and "read" in needs and not os.path.exists(path):
             fault += ", and there is no such file or folder"
         raise MeshFileError(path, fault, remedy=f"supported: {', '.join(suffixes(*needs))}")
     return form

@@ -343,16 +343,16 @@ class SeamedMesh:
         -------
         SeamedMesh
             Rows of ``uv`` keep their numbers. If a vertex moves and other users of its row do not move to the same
-            position, the vertex gets a new row at the end. Without ``uv``, the result has one row for each used row of
-            ``FT``.
+            position, the vertex gets a new row at the end. Without ``uv``, the result has one row for each vertex of
+            each island, in the order of the mesh's vertices; copies follow.
         """
         if len(places) != len(self.islands):
             raise ValueError(f"places must have one array for each of {len(self.islands)} islands, not {len(places)}")
         if self.uv is not None:
             return self._move(self.uv, places)
-        FT = np.full_like(self.FT, -1)
-        rows = np.unique(self.FT[self.mapped])
-        FT[self.mapped] = np.searchsorted(rows, self.FT[self.mapped])
+        FT, _ = self._number_fans()
+        rows = np.unique(FT[self.mapped])
+        FT[self.mapped] = np.searchsorted(rows, FT[self.mapped])
         uv = np.full((len(rows), 2), np.nan)
         for island, now in zip(self.islands, places, strict=True):
             uv[FT[island.triangles]] = now[island.F]

@@ -116,6 +116,11 @@ class MappedAtlas(Outcome):
         return sum(island.result.seconds for island in self.islands)
 
     @property
+    def linear_solver(self) -> str:
+        """The linear solver of the first island that was mapped; empty if none was."""
+        return next((name for island in self.islands if (name := island.result.linear_solver)), "")
+
+    @property
     def status(self) -> Status:
         """The status of the island that made the least progress."""
         return Status.most_severe(island.result.status for island in self.islands)
@@ -147,7 +152,7 @@ class MappedAtlas(Outcome):
         return {
             **super().to_dict(),
             "injective": self.injective,
-            "linear_solver": results[0].linear_solver,
+            "linear_solver": self.linear_solver,
             "islands": [island.to_dict() for island in self.islands],
         }
 

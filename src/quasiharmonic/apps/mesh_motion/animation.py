@@ -114,8 +114,8 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
     energies : (t,) float64
         Mean energy of each polished frame; NaN for others.
     max_motion_ratio : float or None
-        Requested maximum vertex displacement between frames, relative to that of the boundary. None if the frames were
-        not polished.
+        Requested maximum vertex displacement between frames, relative to that of the boundary. None without
+        ``polish``.
     interrupted : bool
         Whether Ctrl-C ended the work before completion.
 
@@ -244,10 +244,12 @@ class Animation(SummarisedOutcome, Sequence[MapResult]):
         if not found.all():
             lines[0] += "; change the targets of the others, or use fill_gaps=True"
         if self.interrupted:
-            smoothed = np.isfinite(self.energies).any()
-            lines.append(
-                f"interrupted before {'the moves between frames were limited' if smoothed else 'the last frame'}"
-            )
+            bare = np.flatnonzero(found & np.isnan(self.energies))
+            missing = "all frames were complete"
+            if self.max_motion_ratio is not None:
+                limiting = "the moves between frames were limited"
+                missing = f"the polish of {names_of('frame', 'frames', bare)}" if bare.size else limiting
+            lines.append(f"interrupted before {missing}")
         if self.bridged.any():
             lines.append(f"between their neighbours: {names_of('frame', 'frames', np.flatnonzero(self.bridged))}")
         overlapping = np.flatnonzero(found & ~self.bijective)

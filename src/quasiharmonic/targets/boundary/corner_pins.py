@@ -310,7 +310,7 @@ def read_corners(text: str) -> CornerSpec:
     if text == "auto":
         return CornerSpec("auto")
     if os.path.isfile(text):
-        lines = Path(text).read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = Path(text).read_text(encoding="utf-8-sig", errors="replace").splitlines()
         words = [re.sub(r"\s*,\s*", ",", line.split("#")[0]).replace(":", " ").split() for line in lines]
         entries = [_parse_entry(":".join(line)) for line in words if line]
     else:

@@ -150,7 +150,7 @@ def _find_problems_below(
         inner = f"{name}/{entry}" if name else entry
         if is_folder:
             yield from _find_problems_below(folder / entry, inner, plain, above | {here})
-        elif plain and _is_surface(folder / entry):
+        elif plain and not entry.startswith(".") and _is_surface(folder / entry):
             yield ProblemFiles(inner, folder / entry, None)
 
 

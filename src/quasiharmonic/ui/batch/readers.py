@@ -172,7 +172,8 @@ def _expand(location: str) -> list[str]:
 def _archives_of(names: list[str]) -> list[str]:
     """Return the names of archives outside the output of runs."""
     outputs = tuple(posixpath.join(posixpath.dirname(name), "") for name in names if posixpath.basename(name) == MARKER)
-    return [name for name in names if is_archive(name) and "" not in outputs and not name.startswith(outputs)]
+    shown = [name for name in names if not posixpath.basename(name).startswith(".")]
+    return [name for name in shown if is_archive(name) and "" not in outputs and not name.startswith(outputs)]
 
 
 def _read_list(path: Path) -> list[ArchiveReader]:

@@ -162,6 +162,8 @@ def _tar_parts(file: BinaryIO, limit: int) -> Iterator[Sample | Damage]:
     """Yield consecutive members of a tar file with the same key as one problem, and damage in between."""
     sample: Sample | None = None
     for member in read_members(file, _is_wanted, limit):
+        if not isinstance(member, Damage) and posixpath.basename(member.name).startswith("."):
+            continue
         key, extension = ("", "") if isinstance(member, Damage) else _split(member.name)
         if sample is not None and (isinstance(member, Damage) or key != sample.key):
             yield sample

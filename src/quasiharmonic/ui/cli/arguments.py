@@ -215,7 +215,8 @@ SHARED: dict[str, Option] = {
     ),
     "islands": number(
         _island_list,
-        "change only these islands, from 0 in the order of their first triangles; the others keep their positions",
+        "change only these islands, from 0 in the order of their first triangles; the others keep their positions "
+        "(--pack moves all islands)",
         metavar="K,K,…",
     ),
     "pack": flag("pack the islands into the unit square by their shapes, all at one texel density"),

@@ -71,28 +71,28 @@ def surface(
             if mesh.FT is not None and getattr(options, "to", "") is not None:
                 # A partial map is sufficient only if the map defines the target of the boundary.
                 io.check_mapped(mesh)
-            found = SeamedSurface(io.seamed(mesh))
-        elif options.seams == "none":
-            found = SeamedSurface(SeamedMesh(mesh.V, mesh.F))
+            before = io.seamed(mesh)
         else:
+            before = SeamedMesh(mesh.V, mesh.F)
+        found = SeamedSurface(before)
+        if options.seams not in ("file", "none"):
             from quasiharmonic.apps.atlas.seam_cuts import cut_along
 
             edges = read_edges(Path(options.seams), len(mesh.V))
             edges = edges if joint is None else joint[edges]
-            found = SeamedSurface(cut_along(SeamedMesh(mesh.V, mesh.F), edges, polygons=mesh.polygons))
+            found.mesh = cut_along(before, edges, polygons=mesh.polygons)
         if options.cut:
             # Imported here because the import takes longer than the work for a small mesh.
             from quasiharmonic.apps.atlas.seam_cuts import cut_apart
 
-            before = found.mesh
             found.mesh = cut_apart(
-                before, polygons=mesh.polygons, disks_too=disks_too, reach=disks_too or options.refine
+                found.mesh, polygons=mesh.polygons, disks_too=disks_too, reach=disks_too or options.refine
             )
             found.facts["cut_edges"] = cut = len(found.mesh.seams) - len(before.seams)
             found.notes.append(
                 f"cut along {count_of('edge', 'edges', cut)}: seams of the map; the model's faces are unchanged"
                 if cut
-                else "nothing to cut: the surface can be flattened without cuts"
+                else "nothing to cut: the surface can be flattened without further cuts"
             )
     islands = len(found.mesh.islands)
     if islands > 1:

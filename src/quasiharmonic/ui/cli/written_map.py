@@ -166,7 +166,7 @@ def describe_maps(mapped: MappedAtlas, written: WrittenMap, output: Path) -> str
         lines += [r.diagnosis.summary() for r in results if r.diagnosis is not None and r.diagnosis.obstructions][:3]
     iterations = sum(result.n_iterations for result in results)
     seconds = sum(result.seconds for result in results)
-    lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {results[0].linear_solver}")
+    lines.append(f"{count_of('iteration', 'iterations', iterations)}, {seconds:.3g} s, {mapped.linear_solver}")
     return "\n".join(lines)
 
 

@@ -148,7 +148,8 @@ def _files(given: list[Path]) -> list[Path]:
     if len(given) == 1 and given[0].is_dir():
         # Formats that are written with a map are read with one.
         accepted = suffixes("write_map")
-        found = sorted((path for path in given[0].iterdir() if path.suffix.lower() in accepted), key=_in_order)
+        shown = (path for path in given[0].iterdir() if not path.name.startswith("."))
+        found = sorted((path for path in shown if path.suffix.lower() in accepted), key=_in_order)
         if not found:
             raise ValueError(f"{given[0]}: no mesh in this folder ({', '.join(accepted)})")
         return found

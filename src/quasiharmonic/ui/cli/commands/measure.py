@@ -42,7 +42,6 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.apps.atlas.atlas_verdict import mirrored_islands, reflect_mirrored
     from quasiharmonic.energies.measures import distortion
-    from quasiharmonic.io.seamed_mesh import SeamedMesh
     from quasiharmonic.util.arrays import names_of
 
     set_default(options, "rings", 20, asked=options.distances, belongs="--distances")
@@ -52,12 +51,10 @@ def run(options: argparse.Namespace) -> int:
     if finite_elements.has_elements(options.input):
         return finite_elements.measure(options)
     mesh = io.read_mesh(options.input)
-    V, F, uv = io.without_idle(*io.cut_at_seams(mesh))
-    opened = SeamedMesh(V, F, F, uv)
-    mirrored = np.flatnonzero(mirrored_islands(opened))
-    if mirrored.size:
-        reflected = reflect_mirrored(opened).uv
-        uv = uv if reflected is None else reflected
+    mapped = io.mapped(mesh)
+    mirrored = np.flatnonzero(mirrored_islands(mapped))
+    turned = mesh.with_places(reflect_mirrored(mapped)) if mirrored.size else mesh
+    V, F, uv = io.without_idle(*io.cut_at_seams(turned))
     with report.name_source(options.input):
         found = distortion(V, F, uv, rings=options.rings if options.distances else None)
     if options.export is not None:

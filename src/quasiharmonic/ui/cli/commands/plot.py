@@ -65,8 +65,6 @@ def run(options: argparse.Namespace) -> int:
 
     image = None if options.texture in (None, CHECKERBOARD) else Path(options.texture)
     report.check_picture("-o", options.output, inputs=(options.input, image))
-    if finite_elements.has_elements(options.input):
-        return finite_elements.plot(options)
     if options.input.name.lower().endswith(FIELD_SUFFIXES):
         if (options.kind, options.measure, options.texture) != (None, None, None):
             raise ValueError(f"{options.input} is a displacement field: omit --kind, --measure and --texture")
@@ -74,6 +72,8 @@ def run(options: argparse.Namespace) -> int:
         with report.name_source(options.input):
             save_picture(options.output, plot_field(given.field, spacing=given.spacing))
         return report.tell_written(options.output)
+    if finite_elements.has_elements(options.input, FIELD_SUFFIXES):
+        return finite_elements.plot(options)
     shows_measure = options.kind == "distortion"
     set_default(options, "measure", "isometric", asked=shows_measure, belongs="--kind distortion")
     if options.texture is not None and options.kind not in (None, "texture"):

@@ -57,12 +57,12 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
             f"{format_names('write_map', 'seams')}"
         ),
     )
-    pair = {"nargs": 2, "metavar": ("FILE", "OUT")}
+    pair = {"nargs": 2, "metavar": ("FILE", "OUT"), "action": "append", "default": []}
     add_options(
         parser,
         values=file(
             f"values of the source to transfer to the target's vertices: {', '.join(_TABLES)} (one row per vertex or "
-            "triangle), or GIFTI data",
+            "triangle), or GIFTI data; may be repeated",
             **pair,
         ),
         nearest=flag(
@@ -74,7 +74,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         ),
         landmarks=file(
             "file of vertices of the source to transfer, 0-based, one per line, and a .csv file to write: vertex, "
-            "triangle of the target, weights of its three corners, nearest corner, position",
+            "triangle of the target, weights of its three corners, nearest corner, position; may be repeated",
             **pair,
         ),
         outside=choice(
@@ -97,11 +97,11 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic.apps.surface_map import SurfaceMap
     from quasiharmonic.util.arrays import count_of
 
-    set_default(options, "per", "vertex", asked=options.values is not None, belongs="--values")
-    if options.nearest and options.values is None:
+    set_default(options, "per", "vertex", asked=bool(options.values), belongs="--values")
+    if options.nearest and not options.values:
         raise ValueError("--nearest needs --values: add --values, or omit --nearest")
     outputs = _outputs(options)
-    inputs = (options.source, options.target, *(pair[0] for pair in (options.values, options.landmarks) if pair))
+    inputs = (options.source, options.target, *(path for path, _ in options.values + options.landmarks))
     report.check_new(outputs, options.json, inputs=inputs)
     source, target = _read(options.source), _read(options.target)
     between = SurfaceMap(target.inverse, source.inverse)
@@ -119,8 +119,8 @@ def run(options: argparse.Namespace) -> int:
         "target": {"file": str(options.target), "certificate": target.inverse.certificate.to_dict()},
     }
     # Compute everything before a file is written.
-    values = None if options.values is None else _values(options, source, between)[:n]
-    marks = None if options.landmarks is None else _landmarks(options, source, target, between)
+    values = [(out, _values(path, options, source, between)[:n]) for path, out in options.values]
+    marks = [(out, _landmarks(path, options, source, target, between)) for path, out in options.landmarks]
     moved = None
     if options.output is not None:
         V = between.transfer(source.inverse.V, outside=options.outside)[:n]
@@ -135,10 +135,10 @@ def run(options: argparse.Namespace) -> int:
         moved = replace(with_map, V=V, normals=b"", FN=None)
         pipeline.tell_losses(options.output, moved)
         io.write_mapped(options.output, moved)
-    if values is not None:
-        _write_table(options.values[1], values)
-    if marks is not None:
-        io.write_whole(options.landmarks[1], marks)
+    for out, table in values:
+        _write_table(out, table)
+    for out, rows in marks:
+        io.write_whole(out, rows)
 
     def describe() -> pipeline.Account:
         instead = "the nearest point of its boundary" if options.outside == "nearest" else "nan"
@@ -165,11 +165,10 @@ def _outputs(options: argparse.Namespace) -> dict[str, Path]:
         io.check_output(options.output)
         outputs["-o"] = options.output
     for name, endings in (("values", _TABLES), ("landmarks", (".csv",))):
-        pair = getattr(options, name)
-        if pair is not None:
-            if pair[1].suffix.lower() not in endings:
-                raise ValueError(f"--{name} … {pair[1]}: written as {', '.join(endings)}")
-            outputs[f"--{name}"] = pair[1]
+        for k, (_, out) in enumerate(getattr(options, name), 1):
+            if out.suffix.lower() not in endings:
+                raise ValueError(f"--{name} … {out}: written as {', '.join(endings)}")
+            outputs[f"--{name}" if k == 1 else f"--{name} ({k})"] = out
     if not outputs:
         raise ValueError("nothing to transfer: add --values, --landmarks or -o")
     return outputs
@@ -191,11 +190,10 @@ def _read(path: Path) -> _MappedFile:
     return _MappedFile(mesh, inverse, origin)
 
 
-def _values(options: argparse.Namespace, source: _MappedFile, between: SurfaceMap) -> NDArray[np.float64]:
+def _values(path: Path, options: argparse.Namespace, source: _MappedFile, between: SurfaceMap) -> NDArray[np.float64]:
     """Read the values of the source, and return those of the target's vertices; NaN for unused vertices."""
     from quasiharmonic.util.arrays import mark
 
-    path = options.values[0]
     values = _read_table(path)
     count = len(source.mesh.V) if options.per == "vertex" else len(source.mesh.F)
     if len(values) != count:
@@ -211,15 +209,17 @@ def _values(options: argparse.Namespace, source: _MappedFile, between: SurfaceMa
     return out
 
 
-def _landmarks(options: argparse.Namespace, source: _MappedFile, target: _MappedFile, between: SurfaceMap) -> bytes:
+def _landmarks(
+    path: Path, options: argparse.Namespace, source: _MappedFile, target: _MappedFile, between: SurfaceMap
+) -> bytes:
     """Return a table of the points of the target that correspond to the landmarks, as CSV."""
     import numpy as np
 
     from quasiharmonic import io
 
-    marks = io.read_handles(options.landmarks[0], len(source.mesh.V))
+    marks = io.read_handles(path, len(source.mesh.V))
     if (source.origin[marks] < 0).any():
-        raise ValueError(f"{options.landmarks[0]}: vertex {marks[source.origin[marks] < 0][0]} belongs to no triangle")
+        raise ValueError(f"{path}: vertex {marks[source.origin[marks] < 0][0]} belongs to no triangle")
     places = source.inverse.uv[marks]
     at = between.source.locate(places)
     if options.outside == "nearest":
