@@ -7,10 +7,11 @@ import pytest
 
 from quasiharmonic import find_cuts, surfaces
 from quasiharmonic.geometry.coarsening import coarsen
+from quasiharmonic.geometry.mesh.reference import flat_triangles
 from quasiharmonic.geometry.mesh.splitting import open_along
 from quasiharmonic.geometry.mesh.topology import edge_keys, edges
 from quasiharmonic.targets.cuts.graph import edge_graph
-from quasiharmonic.targets.cuts.shortening import insert_vertices, shorten_cuts
+from quasiharmonic.targets.cuts.shortening import cut_by_levels, insert_vertices, shorten_cuts
 from shared.closed_surfaces import torus
 from shared.cuts import SURFACES, length_of, parts, random_cut
 
@@ -103,3 +104,16 @@ def test_a_large_surface_that_needs_no_cut():
     V, F = surfaces.grid(130, 130)
     assert len(V) > 15_000
     assert find_cuts(np.column_stack([V, 0.1 * V[:, 0] * V[:, 1]]), F).shape == (0, 2)
+
+    @pytest.mark.parametrize("steps", [4, 6, 8])
+    def test_coarse_triangles_have_areas(self, steps):
+        """The vertices of voxel models lie on a lattice, so that means of them often lie on a line."""
+        V, F = torus(90, 80)
+        seen = []
+
+        def find(graph, vertices, rounds):
+            seen.append(flat_triangles(graph.V, graph.F).size)
+            return np.zeros(len(graph.ends), dtype=bool)
+
+        cut_by_levels(np.round(V * steps) / steps, F, None, find, 3, goal=2000)
+        assert seen == [0]

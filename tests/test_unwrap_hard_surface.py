@@ -384,3 +384,9 @@ def test_gears_have_few_charts_that_fill_the_texture(gear, most, least):
     assert result.certificate.bijective
     assert result.n_charts <= most
     assert result.utilisation > least
+
+
+@pytest.mark.parametrize("size", [(30, 18), (60, 30)])
+def test_a_ring_of_a_smooth_surface_in_one_plane_may_be_cut(size):
+    """The top and the bottom of these tori are flat rings. Kept whole, they would prevent all cuts across them."""
+    assert unwrap(*torus(*size)).n_charts <= 4

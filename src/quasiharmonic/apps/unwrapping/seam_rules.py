@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, find_hinges
 from quasiharmonic.apps.unwrapping.layout import find_differing_sides
-from quasiharmonic.apps.unwrapping.pieces import find_pieces
+from quasiharmonic.apps.unwrapping.pieces import CREASE, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, find_mirror
 from quasiharmonic.geometry.mesh.reference import area_vectors
 from quasiharmonic.geometry.mesh.splitting import fans
@@ -125,7 +125,8 @@ def find_rules(
         if options.symmetry is not None and (plain or options.symmetry != "auto"):
             mirror, symmetry = find_mirror(points, cleaned.F, options.symmetry)
         if not options.divide_for_packing:
-            cost[hinges.mark_sides(hinges.flat, len(cleaned.F))] *= UNDIVIDED_COST
+            whole = hinges.flat & ~_find_smooth_rings(cleaned.F, hinges)
+            cost[hinges.mark_sides(whole, len(cleaned.F))] *= UNDIVIDED_COST
         demanded |= _mark_hard_edges(options.hard_edges, hinges, cleaned, F) & ~kept
     if options.up is not None:
         _prefer_hidden(cost, points, cleaned.F, hinges, options.up, symmetry)
@@ -139,6 +140,24 @@ def find_rules(
         sides = np.stack([cleaned.F[demanded], cleaned.F[:, (1, 2, 0)][demanded]], axis=1)
         uv_cuts = np.concatenate([uv_cuts, sides])
     return Rules(cost, uv, uv_cuts, mirror, symmetry, wanted)
+
+
+def _find_smooth_rings(F: IntArray, hinges: Hinges) -> BoolArray:
+    """Mask (e,) of the hinges in flat faces that are not disks, without a crease around them.
+
+    A ring of triangles that happen to be in one plane, such as the top of a torus, must not prevent cuts across it.
+    """
+    split, face = fans(F, pairs=(hinges.one[hinges.flat], hinges.other[hinges.flat]))
+    of = np.empty(int(split.max(initial=-1)) + 1, dtype=np.int64)
+    of[split] = face[:, None]
+    at = face[hinges.first]
+    # Vertices, less edges, plus triangles: 1 for a disk.
+    euler = (
+        np.bincount(of) - 2 * np.bincount(face) + np.bincount(at[hinges.flat], minlength=int(face.max(initial=-1)) + 1)
+    )
+    creased = np.abs(hinges.angle) >= CREASE
+    sharp = mark(len(euler), at[creased], face[hinges.second[creased]])
+    return hinges.flat & ((euler < 1) & ~sharp)[at]
 
 
 def _prefer_hidden(

@@ -24,6 +24,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.geometry.coarsening import Removal, coarsen
+from quasiharmonic.geometry.mesh.reference import rest_frames
 from quasiharmonic.geometry.mesh.topology import boundary_edges, edge_keys, label_components, pair_keys
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph, find_distinct, triangles_near
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark
@@ -34,6 +35,8 @@ from quasiharmonic.util.progress import heartbeat
 _SAVES = 1e-6
 # Maximum number of rounds over all stretches. Most cuts converge after three.
 _ROUNDS = 8
+# Coarse triangles of less than this height, relative to their sides, are smoothed so many times at most.
+_THIN, _THIN_SWEEPS = 1e-9, 5
 # A stretch is exchanged for paths within this many rings of triangles around it.
 _RINGS = 5
 
@@ -319,6 +322,7 @@ def cut_by_levels(
     rim_keys = pair_keys(rim, n)
     factors = [None] * (len(coarsening.rounds) + 1) if costs is None else _vertex_costs(F, costs, coarsening.rounds, n)
     means = _smooth(_mean_positions(V, fixed, coarsening.rounds), coarsening.F, fixed, sweeps)
+    _raise_thin(means, coarsening.F, fixed)
     vertices, graph = _make_subset(means, coarsening.F, _side_costs(factors[-1], coarsening.F), rim_keys)
     cut = vertices[graph.ends[find(graph, vertices, coarsening.rounds)]]
     if not cut.size:
@@ -353,6 +357,16 @@ def _smooth(V: FloatArray, F: IntArray, fixed: BoolArray, sweeps: int) -> FloatA
         mean = np.stack([np.bincount(tail, x[head], n) for x in V.T], axis=1)[free] / degree[free, None]
         V[free] = 0.5 * (V[free] + mean)
     return V
+
+
+def _raise_thin(V: FloatArray, F: IntArray, fixed: BoolArray) -> None:
+    """Smooth where triangles are too thin for a map: on voxel models, means of positions can lie on a line."""
+    for _ in range(_THIN_SWEEPS):
+        first, second = rest_frames(V, F)
+        thin = np.abs(second.imag) <= _THIN * np.maximum(first, np.abs(second))
+        if not thin.any():
+            break
+        _smooth(V, F, fixed | ~mark(len(V), F[thin]), 1)
 
 
 def _vertex_costs(F: IntArray, costs: FloatArray, rounds: list[list[Removal]], n: int) -> list[FloatArray]:
