@@ -50,6 +50,12 @@ from quasiharmonic.solver.methods.relocation import relocate
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, mark, sum_at, to_points
 from quasiharmonic.util.options import DistanceOptions
 
+# Minimum length of the requested rings, in rings of the coarse mesh.
+_RINGS = 3.0
+# Distances are measured along the next finer mesh, which follows more of the folds, unless the rings are more than this
+# number of its rings.
+_MAX_RINGS = 20
+
 
 class RigidTuning(NamedTuple):
     """Numbers that tune rigid steps."""
@@ -174,13 +180,6 @@ def _rotations(V: FloatArray, F: IntArray, d: Deformation) -> ComplexArray:
         follows[here[use] // 3] = False
     turned[around] = own
     return turned
-
-
-# Minimum length of the requested rings, in rings of the coarse mesh.
-_RINGS = 3.0
-# Distances are measured along the next finer mesh, which follows more of the folds, unless the rings are more than this
-# number of its rings.
-_MAX_RINGS = 20
 
 
 def lower_coarse_distance_error(piece: Piece, options: DistanceOptions, *, least: int = 9000) -> MapResult | None:

@@ -36,6 +36,11 @@ from quasiharmonic.util.arrays import (
     to_points,
 )
 
+#: Surfaces with at least this number of triangles are flattened with coarse meshes.
+COARSE_FROM = 50_000
+# Space between two components, relative to the largest side of all.
+_GAP = 0.05
+
 
 class Piece:
     """A connected surface that can be flattened, in a unit near its size.
@@ -125,10 +130,6 @@ def to_given_unit(uv: FloatArray, exponent: int) -> FloatArray:
     """Convert a map from units of ``2 ** exponent`` to the original unit; ValueError as `check_in_range`."""
     with np.errstate(over="ignore"):
         return check_in_range(np.ldexp(uv, exponent))
-
-
-#: Surfaces with at least this number of triangles are flattened with coarse meshes.
-COARSE_FROM = 50_000
 
 
 class InitialMap(NamedTuple):
@@ -238,10 +239,6 @@ def unite_parts(parts: Sequence[Part]) -> Part:
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.triangles for part in parts]),
     )
-
-
-# Space between two components, relative to the largest side of all.
-_GAP = 0.05
 
 
 def align_with_axis(F: IntArray, uv: FloatArray) -> FloatArray:

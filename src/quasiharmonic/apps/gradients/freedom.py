@@ -25,6 +25,10 @@ from quasiharmonic.geometry.curves.deviation import DeviationBarrier
 from quasiharmonic.problem import Domain
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, work
 
+# Step for differences of the barrier's gradient, relative to the mean length of a boundary edge: the curve's length
+# divided by the number of sliding vertices.
+_STEP = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
@@ -104,11 +108,6 @@ def differentiate_map_size(w: ComplexArray, loops: Sequence[IntArray]) -> Comple
         area += 0.5 * float((here.conj() * following).imag.sum())
         by_area[loop] = -0.5j * (following - np.roll(here, 1))
     return by_area / (2 * area)
-
-
-# Step for differences of the barrier's gradient, relative to the mean length of a boundary edge: the curve's length
-# divided by the number of sliding vertices.
-_STEP = 1e-6
 
 
 class Freedom:

@@ -31,6 +31,9 @@ from quasiharmonic.solver.methods.untangling import untangle
 from quasiharmonic.util.arrays import FloatArray, IntArray, find_exponent, to_points
 from quasiharmonic.util.options import MorphOptions, PolishOptions
 
+# Maximum number of untangling steps; successful runs need a few dozen.
+_MAX_STEPS = 300
+
 
 class Slide(NamedTuple):
     """How the boundary slides: along its polygon (True), not (False), or along curves; and the nodes that do not."""
@@ -153,10 +156,6 @@ def _select_curves(
     positions = np.zeros((problem.n, 2))
     positions[problem.fixed] = problem.target
     return BoundaryCurves.around(problem.domain.loops, positions, fixed=own_fixed)
-
-
-# Maximum number of untangling steps; successful runs need a few dozen.
-_MAX_STEPS = 300
 
 
 def make_convex(problem: Problem, result: MapResult, corners: IntArray, *, linear_solver: str) -> MapResult:

@@ -45,6 +45,10 @@ MOMENTA = 0.6, 0.9
 TANH_STEPS = ((0, 0.5), (10, 0.2), (39, 0.2), (40, 0.05))
 # With si-log, ξ has farther to go to the same tensor, so steps are longer.
 SI_LOG_STEPS = ((0, 0.5),)
+# Corners of the disk are spread half by the target's arc length and half evenly, so that none are too close.
+_EVEN_SHARE = 0.5
+# Schedule after the composite: short steps suffice, and long ones would leave its neighbourhood.
+NEARBY_STEPS = ((0, 0.2), (39, 0.2), (40, 0.05))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,12 +168,6 @@ def adam_step(
         # A triangle whose gradients were all zero does not move.
         root[root == 0] = np.inf
         np.multiply(average, -length / root, out=step[part])
-
-
-# Corners of the disk are spread half by the target's arc length and half evenly, so that none are too close.
-_EVEN_SHARE = 0.5
-# Schedule after the composite: short steps suffice, and long ones would leave its neighbourhood.
-NEARBY_STEPS = ((0, 0.2), (39, 0.2), (40, 0.05))
 
 
 @dataclass(frozen=True, kw_only=True)

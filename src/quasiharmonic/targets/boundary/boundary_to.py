@@ -37,6 +37,8 @@ from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, count_
 
 # Default minimum angle, in degrees, by which an outline turns at a corner.
 DEFAULT_CORNER_ANGLE = 20.0
+# Gap between copies of an outline, relative to the outline's width.
+_GAP = 0.05
 
 
 def match_holes(
@@ -292,10 +294,6 @@ def _check_simple(loops: list[IntArray], target: FloatArray, n: int) -> None:
             "for the shape, or unevenly spaced: split boundary edges (refine with boundary=True), choose other "
             "corners, or an outline with less detail"
         )
-
-
-# Gap between copies of an outline, relative to the outline's width.
-_GAP = 0.05
 
 
 @dataclass(frozen=True, eq=False)

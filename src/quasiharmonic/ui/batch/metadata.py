@@ -23,6 +23,9 @@ from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.ui.batch.records import Record, describe_contents
 from quasiharmonic.util.arrays import FloatArray, IntArray
 
+# Written to /proc/self/clear_refs, this number resets the peak resident memory (VmHWM) of the process; see proc(5).
+_RESET_PEAK = "5"
+
 
 def describe_sizes(problems: list[Problem]) -> Record:
     """Return the total sizes of the problems of a mesh's islands."""
@@ -86,10 +89,6 @@ def list_versions() -> str:
     """Return the versions of Python and packages as JSON."""
     packages = {name: version(name) for name in ("numpy", "scipy")}
     return json.dumps({"quasiharmonic": __version__, "python": platform.python_version(), **packages})
-
-
-# Written to /proc/self/clear_refs, this number resets the peak resident memory (VmHWM) of the process; see proc(5).
-_RESET_PEAK = "5"
 
 
 def reset_peak() -> None:

@@ -25,6 +25,9 @@ from quasiharmonic.ui.studio.validation import RequestError
 MAX_STATES = 40
 # Maximum number of triangles in all stored states together; fewer states of large models are stored.
 _MAX_STORED = 4_000_000
+_INDEX = "index"
+#: Formats in which the page saves the map.
+FORMATS = "obj", "glb", "ply"
 
 
 class History:
@@ -102,9 +105,6 @@ class History:
         return True
 
 
-_INDEX = "index"
-
-
 class StoredSession(NamedTuple):
     """Contents of a session."""
 
@@ -157,10 +157,6 @@ class Storage:
         partial = self.folder / f"{name}.part"
         partial.write_bytes(pickle.dumps(content))
         partial.replace(self.folder / name)
-
-
-#: Formats in which the page saves the map.
-FORMATS = "obj", "glb", "ply"
 
 
 def list_files(state: SessionState, form: str, texture: io.Texture | None) -> dict[str, bytes]:

@@ -39,6 +39,9 @@ Callback = Callable[[UnwrapStep], object] | None
 _DEFAULTS = {"max_stretch": 1.5, "resolution": RESOLUTION, "padding": PADDING}
 # The file from which the script unwraps.
 _MODEL = Code("model")
+_FIRST_OUTLINE = "rect:1x1"
+#: Larger models are not cut and mapped before the user asks, because this takes longer than some seconds.
+MAX_AUTOMATIC = 40_000
 
 
 def unwrap_model(
@@ -146,11 +149,6 @@ def _label_triangles(sheet: PageSurface, which: str) -> IntArray:
     if not has_parts(sheet.mesh, which):
         raise RequestError(f"the file has no {which}: choose other parts, or none")
     return statement_labels(sheet.mesh, *PARTS[which])
-
-
-_FIRST_OUTLINE = "rect:1x1"
-#: Larger models are not cut and mapped before the user asks, because this takes longer than some seconds.
-MAX_AUTOMATIC = 40_000
 
 
 def open_without_map(sheet: PageSurface) -> SessionState:
