@@ -159,35 +159,24 @@ class Storage:
         partial.replace(self.folder / name)
 
 
-def list_files(state: SessionState, form: str, texture: io.Texture | None) -> dict[str, bytes]:
-    """Return the files of a map by name: the model with its map, and its image.
+def make_files(state: SessionState, form: str, texture: io.Texture | None) -> tuple[dict[str, bytes], list[str]]:
+    """Return the files of a map by name, and sentences on what they lack and on textures that the map does not fit.
 
-    In OBJ, also those that the command and the script read. RequestError if there is no map.
+    The files are the model with its map, and its image; in OBJ, also those that the command and the script read.
+    RequestError if there is no map.
     """
-    name, mesh = _saved_model(state, form, texture)
-    files = _write(mesh, name)
+    if form not in FORMATS:
+        raise RequestError(f"unknown format {form[:20]!r}: use {', '.join(FORMATS)}")
+    name, mesh = MAP if form == "obj" else f"map.{form}", mapped_model(state, None if form == "ply" else texture)
+    files, notes = _write(mesh, name), list[str]()
     if form == "obj":
         recipe = state.recipe
         files |= recipe.texts | ({} if recipe.start is None else _write(recipe.start, START))
-    return files
-
-
-def list_losses(state: SessionState, form: str, texture: io.Texture | None) -> list[str]:
-    """Return sentences on what the files of `list_files` lack, and on textures that the map does not fit."""
-    name, mesh = _saved_model(state, form, texture)
-    lost = io.not_held(name, mesh)
-    unfitting = unfitting_textures(state.sheet.mesh, mesh)
-    return [
-        *([describe_unfitting(unfitting)] if unfitting else []),
-        *([f"{name} does not have: {'; '.join(lost)}"] if lost else []),
-    ]
-
-
-def _saved_model(state: SessionState, form: str, texture: io.Texture | None) -> tuple[str, io.MeshData]:
-    """Return the name of the file of a map in a format, and its mesh."""
-    if form not in FORMATS:
-        raise RequestError(f"unknown format {form[:20]!r}: use {', '.join(FORMATS)}")
-    return MAP if form == "obj" else f"map.{form}", mapped_model(state, None if form == "ply" else texture)
+    if unfitting := unfitting_textures(state.sheet.mesh, mesh):
+        notes.append(describe_unfitting(unfitting))
+    if lost := io.not_held(name, mesh):
+        notes.append(f"{name} does not have: {'; '.join(lost)}")
+    return files, notes
 
 
 def mapped_model(state: SessionState, texture: io.Texture | None) -> io.MeshData:

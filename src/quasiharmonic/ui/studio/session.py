@@ -30,7 +30,7 @@ import numpy as np
 from quasiharmonic.io.models.textures import texture_of
 from quasiharmonic.ui.studio import operations, validation
 from quasiharmonic.ui.studio.drag import Follower, drag_weights
-from quasiharmonic.ui.studio.history import list_files, list_losses
+from quasiharmonic.ui.studio.history import make_files
 from quasiharmonic.ui.studio.operations import require_injective, require_map, require_not_mirrored
 from quasiharmonic.ui.studio.protocol import MessageFrame
 from quasiharmonic.ui.studio.seams import draw_seam, erase_seam, move_islands, pack_all, stitch_seam, weld_seams
@@ -368,14 +368,14 @@ class Session(PageUpdates):
 
     def _do_save(self, frame: MessageFrame) -> None:
         form = str(frame.header.get("format", "obj"))
-        files = list_files(self.state, form, self._history.texture)
+        files, notes = make_files(self.state, form, self._history.texture)
         for name, content in files.items():
             self._tell({"kind": "file", "name": name}, {"content": np.frombuffer(content, dtype=np.uint8)})
         self._history.mark_saved()
         self._store()
         self._tell({"kind": "saved"}, {})
-        if losses := list_losses(self.state, form, self._history.texture):
-            self._tell({"kind": "note", "level": "info", "text": "; ".join(losses)}, {})
+        if notes:
+            self._tell({"kind": "note", "level": "info", "text": "; ".join(notes)}, {})
 
 
 def _read_symmetry(frame: MessageFrame) -> str | None:
