@@ -41,8 +41,8 @@ from quasiharmonic.targets.boundary.boundary_to import FittedProblem
 from quasiharmonic.ui.batch import groups, island_problems, metadata, records
 from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
+from quasiharmonic.ui.worker_pipes import open_pipes
 from quasiharmonic.util.options import PolishOptions
-from quasiharmonic.util.threads import open_pipes
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"

@@ -17,7 +17,7 @@ from quasiharmonic.ui.studio.history import Storage
 from quasiharmonic.ui.studio.protocol import Array, MessageFrame, decode, encode
 from quasiharmonic.ui.studio.session import Session
 from quasiharmonic.ui.studio.surface import read_sheet
-from quasiharmonic.util.threads import open_pipes
+from quasiharmonic.ui.worker_pipes import open_pipes
 
 #: Maximum total size of waiting messages, bytes.
 MAX_WAITING = 256 << 20
