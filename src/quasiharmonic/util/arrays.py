@@ -390,7 +390,8 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
 
 def _array(name: str, values: ArrayLike) -> NDArray[Any]:
     """Convert values, including PyTorch and JAX arrays, to an array, or raise a ValueError that says what they are."""
-    if np.ma.is_masked(values):
+    # Only arrays with this attribute can be masked; for others, `numpy.ma` need not be imported.
+    if hasattr(values, "mask") and np.ma.is_masked(values):
         raise ValueError(f"{name} has masked elements: fill them or leave them out")
     try:
         # `asarray` treats objects that offer their memory only by DLPack as scalars.

@@ -37,7 +37,6 @@ from quasiharmonic.util.progress import heartbeat
 if TYPE_CHECKING:
     from scipy.sparse import bsr_array
 
-
 # Pairs of vertices of a tetrahedron whose blocks are computed; the others are their transposes.
 VERTEX_PAIRS = tuple((i, j) for i in range(4) for j in range(i, 4))
 

@@ -243,8 +243,8 @@ def boundary_to(
 def _contours(outline: Sequence[ArrayLike] | FloatArray | str | PathLike[str], surface: Domain) -> list[ArrayLike]:
     """The given contours, or those that the specification describes."""
     if isinstance(outline, str | PathLike):
-        described = list(specified(outline))
-        return list(filled(described)) if len(surface.loops) == 1 < len(described) else list(described)
+        described = list[ArrayLike](specified(outline))
+        return list(filled(described)) if len(surface.loops) == 1 < len(described) else described
     if not isinstance(outline, Iterable):
         raise ValueError(f'outline must be contours (k, 2), or words as "letter:R", not {describe(outline)}')
     contours = list(outline)

@@ -35,7 +35,7 @@ from quasiharmonic.util.progress import heartbeat
 _SAVES = 1e-6
 # Maximum number of rounds over all stretches. Most cuts converge after three.
 _ROUNDS = 8
-# Coarse triangles of less than this height, relative to their sides, are smoothed so many times at most.
+# Coarse triangles lower than this share of a side are smoothed, at most this number of times.
 _THIN, _THIN_SWEEPS = 1e-9, 5
 # A stretch is exchanged for paths within this many rings of triangles around it.
 _RINGS = 5
