@@ -18,8 +18,10 @@ from quasiharmonic import (
     inverted_triangles,
     io,
     is_injective,
+    nearest_invertible,
     polish,
     refine,
+    unwrap,
     warp_by_landmarks,
 )
 from quasiharmonic.apps.mesh_motion.quality import element_quality
@@ -191,6 +193,13 @@ def test_masked_elements_are_rejected():
             certify(*wrong)
     with pytest.raises(ValueError, match="extra has masked elements"):
         io.MeshData(V, F, extra=np.ma.masked_less(V, 0.5))
+    chosen = np.ma.array([True] * len(F), mask=[True] + [False] * (len(F) - 1))
+    with pytest.raises(ValueError, match="faces has masked elements"):
+        unwrap(V, F, uv=UV, faces=chosen)
+    with pytest.raises(ValueError, match="fixed has masked elements"):
+        nearest_invertible(np.zeros((2, 2, 2)), fixed=np.ma.masked_equal([[True, False], [True, True]], False))
+    with pytest.raises(ValueError, match="cells of a dict has masked elements"):
+        certify({"points": V, "cells": np.ma.masked_equal([[0, 1, 2, 3]], 3)}, UV)
 
 
 def test_invalid_frames():

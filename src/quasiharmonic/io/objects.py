@@ -322,9 +322,9 @@ def _triangles(V: FloatArray, name: str, faces: Any, kinds: Any) -> IntArray:
         rings = [index_array(name, ring) for ring in faces]
         return _cut(V, np.concatenate(rings), np.array([len(ring) for ring in rings]))
     if array.ndim == 1 and array.size:
-        return _cut(V, *_vtk(name, index_array(name, array), kinds))
+        return _cut(V, *_vtk(name, index_array(name, faces), kinds))
     if array.ndim == 2 and array.shape[1] > 3:
-        return _cut(V, index_array(name, array).ravel(), np.full(len(array), array.shape[1]))
+        return _cut(V, index_array(name, faces).ravel(), np.full(len(array), array.shape[1]))
     return triangle_rows(faces, name)
 
 

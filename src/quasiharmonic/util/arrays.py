@@ -40,9 +40,25 @@ class ReadOnly:
         self._seal()
 
 
+def convert_array(name: str, values: ArrayLike) -> NDArray[Any]:
+    """Convert values, including PyTorch and JAX arrays, to an array, of any type and perhaps without a copy."""
+    # Only arrays with this attribute can be masked; for others, `numpy.ma` need not be imported.
+    if hasattr(values, "mask") and np.ma.is_masked(values):
+        raise ValueError(f"{name} has masked elements: fill them or leave them out")
+    try:
+        # `asarray` treats objects that offer their memory only by DLPack as scalars.
+        if hasattr(values, "__dlpack__") and not hasattr(values, "__array__"):
+            return np.from_dlpack(cast(Any, values))
+        return np.asarray(values)
+    except (TypeError, ValueError, RuntimeError, BufferError) as error:
+        if isinstance(error, ValueError) and isinstance(values, list | tuple):
+            raise ValueError(f"{name} is not an array: its rows differ in length") from error
+        raise ValueError(f"{name} is {describe(values)} {_explain_failure(name, values, error)}") from error
+
+
 def real_array(name: str, values: ArrayLike) -> FloatArray:
     """Convert real numbers of any type to float64; always returns a copy. Numbers out of range become infinite."""
-    array = _array(name, values)
+    array = convert_array(name, values)
     if array.dtype.kind not in "iufb":
         raise ValueError(f"{name} must contain real numbers, not {_describe_elements(values, array)}")
     if array.dtype == np.float64:
@@ -54,7 +70,7 @@ def real_array(name: str, values: ArrayLike) -> FloatArray:
 
 def index_array(name: str, values: ArrayLike, *, copy: bool = True) -> IntArray:
     """Convert integers of any type to int64; returns a copy unless ``copy`` is False. Empty input may have any type."""
-    array = _array(name, values)
+    array = convert_array(name, values)
     if array.size == 0:
         array = np.empty(array.shape, dtype=np.int64)
     if array.dtype.kind in "fO" and (integers := _integers(values, array)) is not None:
@@ -386,22 +402,6 @@ def check_choice(name: str, value: object, choices: Collection[str]) -> None:
     if not isinstance(value, str) or value not in tuple(choices):
         given = repr(value) if isinstance(value, str) else describe(value)
         raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given}{suggest(value, choices)}")
-
-
-def _array(name: str, values: ArrayLike) -> NDArray[Any]:
-    """Convert values, including PyTorch and JAX arrays, to an array, or raise a ValueError that says what they are."""
-    # Only arrays with this attribute can be masked; for others, `numpy.ma` need not be imported.
-    if hasattr(values, "mask") and np.ma.is_masked(values):
-        raise ValueError(f"{name} has masked elements: fill them or leave them out")
-    try:
-        # `asarray` treats objects that offer their memory only by DLPack as scalars.
-        if hasattr(values, "__dlpack__") and not hasattr(values, "__array__"):
-            return np.from_dlpack(cast(Any, values))
-        return np.asarray(values)
-    except (TypeError, ValueError, RuntimeError, BufferError) as error:
-        if isinstance(error, ValueError) and isinstance(values, list | tuple):
-            raise ValueError(f"{name} is not an array: its rows differ in length") from error
-        raise ValueError(f"{name} is {describe(values)} {_explain_failure(name, values, error)}") from error
 
 
 def _explain_failure(name: str, values: Any, error: Exception) -> str:

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.problem.result import Status
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, names_of, real_array
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, convert_array, names_of, real_array
 from quasiharmonic.util.outcome import SummarisedOutcome
 
 # Corner triangles of a cell whose vertices are numbered along x and then along y.
@@ -226,7 +226,7 @@ def check_fixed(fixed: ArrayLike | None, grid: Grid) -> BoolArray:
     """Return the mask of the fixed points; ValueError if it has another shape or dtype."""
     if fixed is None:
         return np.zeros(grid.shape, dtype=bool)
-    mask = np.asarray(fixed)
+    mask = convert_array("fixed", fixed)
     if mask.shape != grid.shape or mask.dtype != bool:
         raise ValueError(f"fixed must be a bool array of shape {grid.shape}, not {mask.dtype} of shape {mask.shape}")
     return mask

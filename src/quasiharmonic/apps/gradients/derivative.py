@@ -26,6 +26,7 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_finite,
+    convert_array,
     map_array,
     real_array,
     target_positions,
@@ -318,7 +319,7 @@ def _check_rest(rest: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
 
 
 def _check_mu(mu: ArrayLike, f: int) -> ComplexArray:
-    array = np.asarray(mu)
+    array = convert_array("mu", mu)
     if array.shape != (f,) or array.dtype.kind not in "iufc":
         raise ValueError(
             f"mu must contain {f} numbers, one for each triangle, not {array.dtype} of shape {array.shape}"

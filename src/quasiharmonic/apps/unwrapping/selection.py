@@ -19,6 +19,7 @@ from quasiharmonic.util.arrays import (
     FloatArray,
     IntArray,
     check_range,
+    convert_array,
     find_exponent,
     index_array,
     mark,
@@ -30,8 +31,9 @@ from quasiharmonic.util.arrays import (
 
 def read_faces(faces: ArrayLike, count: int) -> BoolArray:
     """Return a mask (f,) of the triangles that ``faces`` selects by a mask or by numbers."""
-    if np.asarray(faces).dtype == np.bool_:
-        mask = np.array(faces, dtype=np.bool_)
+    given = convert_array("faces", faces)
+    if given.dtype == np.bool_:
+        mask = given.copy()
         if mask.shape != (count,):
             raise ValueError(f"faces must be a mask of shape ({count},) or numbers of triangles, not {mask.shape}")
     else:

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.util.arrays import ComplexArray, FloatArray, reject
+from quasiharmonic.util.arrays import ComplexArray, FloatArray, convert_array, reject
 
 # Replaces a divisor of zero whose dividend is zero too, to avoid NaN.
 _TINY = 1e-300
@@ -148,7 +148,7 @@ def beltrami_coefficients(mu: ArrayLike | None, f: int) -> ComplexArray:
     ValueError
         If the shape is wrong, the values are not numbers, or a modulus is not below 1; names the first triangles.
     """
-    coefficients = np.zeros(f) if mu is None else np.asarray(mu)
+    coefficients = np.zeros(f) if mu is None else convert_array("mu", mu)
     if coefficients.shape != (f,) or coefficients.dtype.kind not in "iufc":
         raise ValueError(f"mu must contain {f} numbers, one for each triangle, not an array of {coefficients.shape}")
     reject(~(np.abs(coefficients) < 1), "triangle", "triangles", "mu is not below 1 in modulus at {}")
