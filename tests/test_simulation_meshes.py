@@ -316,6 +316,13 @@ def test_failed_repair_causes_no_warning():
     assert morphed.inverted.tolist() == [k for k, row in enumerate(F) if min_jacobian(morphed.points[row]) <= 0]
 
 
+def test_an_element_moved_to_a_point_is_reported_without_a_warning():
+    points, F = second_order(*surfaces.grid(3, 3))
+    element = next(row for row in F if not np.isin(row[:3], rim(F)).any())
+    morphed = morph(points, F, element, np.repeat(points[element[:1]], 6, axis=0))
+    assert np.flatnonzero((F == element).all(axis=1)) in morphed.inverted
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("slide", [True, "rails"])
 def test_mid_side_nodes_slide_too(flap, slide):

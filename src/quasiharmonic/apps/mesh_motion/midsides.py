@@ -154,8 +154,11 @@ class _Displacement:
 
     def __init__(self, F: IntArray, first: FloatArray, free: IntArray) -> None:
         self._F, self._first, self._free = F, first, free
-        self._unit = np.abs(jacobian_coefficients(*_chords(F, first))[:, 0])
-        self._size = np.sqrt(self._unit.mean())
+        unit = np.abs(jacobian_coefficients(*_chords(F, first))[:, 0])
+        mean = unit.mean() or 1.0
+        # Elements whose corners coincide or are collinear are compared with the mean.
+        self._unit = np.where(unit > 0, unit, mean)
+        self._size = np.sqrt(mean)
         self._number = invert_indices(len(first), free)
 
     def _find_displacement(self, now: FloatArray) -> FloatArray:
