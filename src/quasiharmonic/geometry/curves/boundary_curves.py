@@ -17,10 +17,12 @@ from quasiharmonic.util.arrays import (
     IntArray,
     check_numbers,
     check_range,
+    cyclic_pairs,
     describe,
     index_array,
     invert_indices,
     loop_arrays,
+    names_of,
     reject,
     to_complex,
     vertex_names,
@@ -325,21 +327,19 @@ def _check_order(chain: Chain, k: int, loops: Sequence[IntArray], n: int) -> Non
     count = chain.vertices.size
     same = np.flatnonzero(np.diff(chain.s) <= 0)
     if same.size:
-        i, j = chain.vertices[same[0]], chain.vertices[same[0] + 1]
-        raise ValueError(
-            f"boundary vertices {i} and {j} have the same position on curve {k}: separate them, or "
-            f"keep their order along the curve"
-        )
+        pairs = np.stack([chain.vertices[same], chain.vertices[same + 1]], axis=1)
+        named = names_of("vertices", "vertices", pairs)
+        raise ValueError(f"boundary {named} have the same position on curve {k}: separate them")
     rank = invert_indices(n, chain.vertices)
-    for loop in loops:
-        here, there = rank[loop], rank[np.roll(loop, -1)]
-        apart = np.abs(here - there)
-        if chain.curve.closed:
-            apart = np.minimum(apart, count - apart)
-        wrong = np.flatnonzero((here >= 0) & (there >= 0) & (apart > 1))
-        if wrong.size:
-            i, j = loop[wrong[0]], np.roll(loop, -1)[wrong[0]]
-            raise ValueError(
-                f"boundary vertices {i} and {j} are neighbours on the boundary but not along curve {k}: correct their "
-                "order, or, if curves are close together, assign vertices to curves (BoundaryCurves, on=)"
-            )
+    sides = np.concatenate([cyclic_pairs(loop) for loop in loops])
+    here, there = rank[sides].T
+    apart = np.abs(here - there)
+    if chain.curve.closed:
+        apart = np.minimum(apart, count - apart)
+    wrong = sides[(here >= 0) & (there >= 0) & (apart > 1)]
+    if len(wrong):
+        raise ValueError(
+            f"boundary {names_of('vertices', 'vertices', wrong)} are neighbours on the boundary but not along curve "
+            f"{k}: correct their order, or, if curves are close together, assign vertices to curves "
+            "(BoundaryCurves, on=)"
+        )
