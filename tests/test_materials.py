@@ -94,6 +94,22 @@ def test_a_library_is_found_from_another_folder(name, tmp_path):
     assert (there / "out.obj").read_text().startswith(line + "\n")
 
 
+def test_several_libraries_keep_their_quotes(tmp_path):
+    (tmp_path / "my in").mkdir()
+    source = tmp_path / "my in" / "mesh.obj"
+    for line, names in (
+        ('"my colours.mtl" "b.mtl"', ["my colours.mtl", "b.mtl"]),
+        ("a.mtl b.mtl", ["a.mtl", "b.mtl"]),
+        ('"my colours.mtl"', ["my colours.mtl"]),
+    ):
+        for name in names:
+            (source.parent / name).touch()
+        source.write_text(f"mtllib {line}\n{SQUARE}{HALVES}")
+        io.write_mapped(tmp_path / "out.obj", io.read_mesh(source))
+        written = (tmp_path / "out.obj").read_text().splitlines()[0]
+        assert written == "mtllib " + " ".join(f'"my in/{name}"' for name in names)
+
+
 def test_a_missing_library_keeps_its_name(tmp_path):
     source = tmp_path / "mesh.obj"
     source.write_text("mtllib  gone.mtl here.mtl\n" + SQUARE + HALVES)

@@ -150,7 +150,9 @@ def with_libraries(path: str | os.PathLike[str], mesh: MeshData) -> MeshData:
     for at, line in enumerate(lines):
         names = library_names(line, here, there)
         if (new := [rename(name) for name in names]) != names:
-            lines[at] = os.fsencode("mtllib " + " ".join(new))
+            # Among several names, those with blanks need quotes.
+            quoted = (b'"' in line or (len(new) > 1 and " " in "".join(new))) and '"' not in "".join(new)
+            lines[at] = os.fsencode("mtllib " + " ".join(f'"{name}"' if quoted else name for name in new))
     statements = b"\n".join(lines)
     return mesh if statements == mesh.statements else replace(mesh, statements=statements)
 
