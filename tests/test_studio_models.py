@@ -203,6 +203,19 @@ def test_a_model_that_was_turned_is_saved_like_that(visitor, tmp_path, step):
     assert atlas.certify(io.mapped(saved)).injective
 
 
+def test_a_model_that_was_turned_is_saved_with_turned_normals(visitor, tmp_path):
+    faces = "f 1/1/1 2/2/1 3/3/2\nf 1/1/1 3/3/2 4/4\n"
+    corners = [f"{x} {y}" for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    lines = [*(f"v {at} 0" for at in corners), *(f"vt {at}" for at in corners), "vn 0 0.0 1", "vn -0.6\t0 +.8", faces]
+    visitor.does("load", {"content": np.frombuffer("\n".join(lines).encode(), np.uint8)}, name="square.obj")
+    visitor.does("turn")
+    (tmp_path / "map.obj").write_bytes(visitor.files()["map.obj"])
+    saved = io.read_mesh(tmp_path / "map.obj")
+    assert saved.normals == b"vn 0 0.0 -1\nvn 0.6\t0 -.8\n"
+    assert saved.F.tolist() == [[0, 2, 1], [0, 3, 2]]
+    assert saved.FN.tolist() == [[0, 1, 0], [0, -1, 1]]
+
+
 @pytest.mark.slow
 def test_the_rest_of_a_map_is_unwrapped_like_a_whole_model(visitor):
     V, Q = quads()

@@ -5,6 +5,7 @@ Normals are OBJ lines, and colours are numbers after the coordinates, whatever t
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,9 @@ from quasiharmonic.util.arrays import (
 
 if TYPE_CHECKING:
     from quasiharmonic.geometry.mesh.splitting import Refined
+
+# The sign of a number other than zero, which may be missing, in a line of numbers.
+_NONZERO_SIGN = re.compile(rb"(?<=[ \t])[-+]?(?=0*\.?0*[1-9])")
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,14 +195,14 @@ class MeshData:
         return replace(self, vt=mapped.uv, FT=mapped.FT)
 
     def turn_over(self) -> MeshData:
-        """Return the same mesh with all faces reversed, without normals; only glTF files keep their other data."""
+        """Return the same mesh with all faces and normals reversed; only glTF files keep their other data."""
         turn = [0, 2, 1]
         return replace(
             self,
             F=self.F[:, turn],
             FT=None if self.FT is None else self.FT[:, turn],
-            normals=b"",
-            FN=None,
+            normals=_NONZERO_SIGN.sub(lambda sign: b"" if sign.group() == b"-" else b"-", self.normals),
+            FN=None if self.FN is None else self.FN[:, turn],
             polygons=None if self.polygons is None else self.polygons.turn_over(),
             lower_maps=tuple(places[:, turn] for places in self.lower_maps),
             carried=None if self.carried is None else self.carried.turn_over(),
