@@ -220,6 +220,10 @@ def test_lightmaps_of_files(tmp_path):
     assert len(written.F) == 24
     assert len({*written.carried.number_meshes()}) == 2
     assert json.loads(report.read_text())["charts"] == 12
+    for options in ({"lightmap": True}, {"instances": "own"}):
+        result = unwrap(tmp_path / "in.glb", resolution=128, **options)
+        assert len(result.indices) == 24
+    assert len(unwrap(tmp_path / "in.glb", resolution=128).indices) == 12
 
 
 @pytest.mark.parametrize(("shared", "densities"), [("share", [1, 1]), ("own", [1, 0.5])])

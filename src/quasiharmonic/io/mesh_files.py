@@ -10,17 +10,18 @@ Mappings Benchmark (Du et al. 2020): a folder with ``input.obj`` and ``handles.t
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from quasiharmonic.geometry.mesh.topology import boundary_edges
 from quasiharmonic.io.atomic import check_writable
 from quasiharmonic.io.errors import MeshFileError, check_path, report_damage
-from quasiharmonic.io.formats.gltf.reader import CarriedGltf, read_channel
+from quasiharmonic.io.formats.gltf.reader import CarriedGltf, read_channel, read_gltf
 from quasiharmonic.io.formats.ply import CarriedPly, read_second_places
 from quasiharmonic.io.models.mesh_maps import vertex_places, with_corner_map
 from quasiharmonic.io.models.meshdata import MeshData
@@ -51,6 +52,17 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshData:
         If the format is not supported, or the file is not valid in its format.
     """
     return find_function(path, "read")(path)
+
+
+def separates_instances(path: str | os.PathLike[str], options: Mapping[str, Any]) -> bool:
+    """Return whether options of `unwrap` require that each occurrence of a mesh in a file becomes a mesh of its own."""
+    separate = options.get("instances") == "own" or bool(options.get("lightmap"))
+    return separate and Path(path).suffix.lower() in (".glb", ".gltf")
+
+
+def read_model(path: str | os.PathLike[str], options: Mapping[str, Any]) -> MeshData:
+    """Read a model for `unwrap` with these options."""
+    return read_gltf(path, instances="own") if separates_instances(path, options) else read_mesh(path)
 
 
 def write_mapped(path: str | os.PathLike[str], mesh: MeshData) -> None:

@@ -17,7 +17,7 @@ from quasiharmonic.apps.unwrapping.model_files import label_statements
 from quasiharmonic.apps.unwrapping.result import UnwrapResult
 from quasiharmonic.io.accepts_mesh import AcceptsMesh
 from quasiharmonic.io.formats.gltf.reader import compare_size
-from quasiharmonic.io.mesh_files import read_mesh
+from quasiharmonic.io.mesh_files import read_model, separates_instances
 from quasiharmonic.io.models.meshdata import MeshData
 from quasiharmonic.io.objects import MeshLike, make_trimesh, mesh_arrays, stands_for_mesh
 from quasiharmonic.util.arrays import (
@@ -205,7 +205,10 @@ def accepts_scene(function: AcceptsMesh[P, UnwrapResult]) -> AcceptsScene[P]:
         given = args[0] if len(args) == 1 else options.pop("V", None) if not args and "F" not in options else None
         if given is None or "F" in options:
             return called(*args, **options)
-        given = read_mesh(given) if isinstance(given, str | PathLike) else given
+        if isinstance(given, str | PathLike):
+            separated, given = separates_instances(given, options), read_model(given, options)
+            if separated:
+                options.pop("instances", None)
         if _is_scene(given) or _is_list_of_meshes(given):
             return _unwrap_scene(called, given, **options)
         if isinstance(given, MeshData) and given.carried is not None and given.carried.fits(given):

@@ -111,8 +111,10 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     meshes : (n,) array of int, optional
         Mesh of each vertex, if ``V`` and ``F`` are several meshes. Vertices of different meshes are not welded.
     instances : str
-        For a mesh that occurs several times in the list or the scene: with ``"share"``, all occurrences share their
-        texture coordinates, at the density of the largest; with ``"own"``, each occurrence has its own.
+        For a mesh that occurs several times in the list, the scene or the glTF file: with ``"share"``, all occurrences
+        share their texture coordinates, at the density of the largest; with ``"own"``, each occurrence has its own.
+        With ``lightmap``, ``"own"`` applies. The vertices of a file are then those of
+        ``io.read_gltf(path, instances="own")``.
     weights : sequence or mapping of float, optional
         Factors on the texel density: one for each mesh of a list, or by names of the meshes of a scene.
     hard_edges : float, (k, 2) array of int, or "file", optional

@@ -31,7 +31,7 @@ from quasiharmonic.energies.polishing import limit_polish, polish_result
 from quasiharmonic.geometry.curves import BoundaryCurves
 from quasiharmonic.geometry.mesh.splitting import Refined
 from quasiharmonic.io.errors import FileInUseError
-from quasiharmonic.io.formats.gltf.reader import read_gltf
+from quasiharmonic.io.mesh_files import read_model
 from quasiharmonic.io.seamed_mesh import SeamedMesh
 from quasiharmonic.io.untrusted import use_bound
 from quasiharmonic.problem.result import MapResult, Status
@@ -132,7 +132,7 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -
     settings = job["settings"]
     path = records.map_path(folder, settings["map_format"])
     with metadata.time_phase(record, "read"), use_bound(job["record"].get("memory_limit")):
-        mesh = _read_model(Path(job["mesh"]), settings["unwrap"])
+        mesh = read_model(job["mesh"], settings["unwrap"] or {})
     if settings["unwrap"] is not None:
         _unwrap_model(mesh, settings["unwrap"], path, record, tell)
         return
@@ -159,13 +159,6 @@ def fill_record(job: dict[str, Any], folder: Path, record: Record, tell: Tell) -
         record |= _write_map(path, mapped, "bijective" if settings["flatten"] else "injective")
     with metadata.time_phase(record, "measure"):
         record |= metadata.describe_distortion(*io.without_idle(*io.cut_at_seams(mapped)))
-
-
-def _read_model(path: Path, options: dict[str, Any] | None) -> io.MeshData:
-    """Read a mesh; for a lightmap, each occurrence of a mesh in a glTF file as a mesh of its own."""
-    if options is not None and options.get("lightmap") and path.suffix.lower() in (".glb", ".gltf"):
-        return read_gltf(path, instances="own")
-    return io.read_mesh(path)
 
 
 def _unwrap_model(mesh: io.MeshData, options: dict[str, Any], path: Path, record: Record, tell: Tell) -> None:

@@ -139,19 +139,20 @@ def run(options: argparse.Namespace) -> int:
 
 def _read(options: argparse.Namespace, source: Path) -> MeshData:
     """Read the model within the limit of memory."""
-    from quasiharmonic.io.formats.gltf.reader import GPU_INSTANCES, read_gltf
+    from quasiharmonic.io.formats.gltf.reader import GPU_INSTANCES
+    from quasiharmonic.io.mesh_files import read_model, separates_instances
     from quasiharmonic.io.untrusted import use_bound
 
-    has_instances = source.suffix.lower() in (".glb", ".gltf")
+    separated = separates_instances(source, vars(options))
     with use_bound(options.memory):
-        if options.instances == "own" and not has_instances:
+        if options.instances == "own" and not separated:
             raise ValueError(f"{source} has no instances: omit --instances, or give a glTF file")
-        if not has_instances or (options.instances != "own" and not options.lightmap):
+        if not separated:
             return pipeline.read_mesh(options, source)
         if options.texture is not None:
             word = "--lightmap" if options.lightmap else "--instances"
             raise ValueError(f"--texture makes one material for all meshes: omit --texture or {word}")
-        mesh = read_gltf(source, instances="own")
+        mesh = read_model(source, vars(options))
         if mesh.carried is not None and GPU_INSTANCES in mesh.carried.further():
             process.tell(f"{GPU_INSTANCES} share their texture coordinates: to separate them, save each as a node")
         return mesh
