@@ -226,6 +226,30 @@ def test_faces_that_a_reader_splits_into_inverted_triangles_are_named(tmp_path, 
     assert ("splits faces at their first corner" in capsys.readouterr().out) == bool(bent)
 
 
+@pytest.mark.parametrize(
+    ("faces", "code", "words", "inverted"),
+    [
+        ("f 1 2 5 4\nf 2/2 3/3 6/6 5/5\n", 0, "there are no texture coordinates on face 0", []),
+        ("f 1 2 5 4\nf 2/2 3/3 5/5\nf 3/3 6/1 5/5\n", 1, "1 is inverted (3)", [3]),
+        # One face without coordinates, another without one of them, and two islands.
+        ("f 2/2 5/5 4\nf 1/1 2/2 4/4\nf 2 5 3\nf 3/3 6/6 5/5\n", 0, "on faces 0, 2", []),
+        ("f 1 2 4\nf 2/2 5/5 4/4\nf 3/3 6/6 5/5\nf 2/7 3/3 5/5\n", 1, "island at triangle 2 (2 triangles)", [3]),
+    ],
+)
+def test_check_verifies_the_faces_that_have_texture_coordinates(tmp_path, capsys, faces, code, words, inverted):
+    corners = [f"{x} {y}" for y in (0, 1) for x in (0, 1, 2)]
+    path = tmp_path / "m.obj"
+    path.write_text("".join([*(f"v {at} 0\n" for at in corners), *(f"vt {at}\n" for at in [*corners, "3 3"]), faces]))
+    assert main(["check", str(path), "--json", "-"]) == code
+    out, err = capsys.readouterr()
+    assert words in err
+    found = json.loads(out)
+    bare = [k for k, face in enumerate(faces.splitlines()) if any("/" not in corner for corner in face.split()[1:])]
+    assert found["unmapped_faces"] == bare
+    assert found["inverted"] + found["degenerate"] == inverted
+    assert main(["check", str(path), "--any-triangulation", "--as", "float32"]) == code
+
+
 @pytest.mark.slow
 def test_repair_names_faces_that_a_reader_splits_into_inverted_triangles(tmp_path, capsys):
     points, places = "v 0 0 0\nv 2 0 0\nv .5 .5 0\nv 0 2 0\n", "vt 0 0\nvt 1 0\nvt .4 .4\nvt 0 1\n"

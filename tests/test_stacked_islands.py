@@ -80,7 +80,7 @@ def test_defective_maps_take_memory_in_proportion_to_their_size():
     uv = V.copy()
     uv[len(V) // 2] += 3 / 70
     tracemalloc.start()
-    certify_defective(np.pad(V, [(0, 0), (0, 1)]), F, uv[F])
+    certify_defective(np.pad(V, [(0, 0), (0, 1)]), F, uv[F], np.arange(len(F)))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     # All pairs of vertices would take 200 MB.

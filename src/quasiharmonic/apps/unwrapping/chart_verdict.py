@@ -234,7 +234,9 @@ class SetApart:
         return "\n".join(f"{names_of('triangle', 'triangles', found)}: {what}" for found, what in kinds if found.size)
 
 
-def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tuple[AtlasVerdict, SetApart] | None:
+def certify_defective(
+    V: FloatArray, F: IntArray, corner_uv: FloatArray, numbers: IntArray
+) -> tuple[AtlasVerdict, SetApart] | None:
     """Certify the charts of a model with defects.
 
     In a file of single precision, positions may coincide that differ in the model. So triangles without area, and
@@ -248,11 +250,13 @@ def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tupl
         Triangles.
     corner_uv : (f, 3, 2) float64
         Texture coordinates of every corner.
+    numbers : (f,) int64
+        Ascending numbers of the triangles in the verdict.
 
     Returns
     -------
     AtlasVerdict and SetApart, or None
-        The indices are those of ``F``. None if all triangles are verified as they are, if no triangle has an area, or
+        None if all triangles are verified as they are, if no triangle has an area, or
         if a chart consists of excluded triangles alone and overlaps another.
     """
     try:
@@ -274,16 +278,18 @@ def certify_defective(V: FloatArray, F: IntArray, corner_uv: FloatArray) -> tupl
         verdict = certify(SeamedMesh(mesh.V, mesh.F[:, ::-1], mesh.F[:, ::-1], mesh.uv))
     elif not (excluded_copies.any() or turned.any()):
         return None
-    islands = tuple(
-        replace(one, triangles=rows[one.triangles], inverted=rows[one.inverted], mirrored=one.mirrored or inward)
-        for one in verdict.islands
-    )
     excluded = mark(len(F), cleaned.excluded)
-    unsure = [k for k, one in enumerate(islands) if excluded[one.triangles].all()]
+    unsure = [k for k, one in enumerate(verdict.islands) if excluded[rows[one.triangles]].all()]
     if np.isin(verdict.overlapping, unsure).any():
         return None
     repeated = cleaned.excluded[cleaned.repeated & excluded_copies[cleaned.excluded]]
-    apart = SetApart(rows[turned], repeated, np.setdiff1d(np.flatnonzero(excluded_copies), repeated))
+    left_out = np.setdiff1d(np.flatnonzero(excluded_copies), repeated)
+    apart = SetApart(*(numbers[found] for found in (rows[turned], repeated, left_out)))
+    shown = numbers[rows]
+    islands = tuple(
+        replace(one, triangles=shown[one.triangles], inverted=shown[one.inverted], mirrored=one.mirrored or inward)
+        for one in verdict.islands
+    )
     return replace(verdict, islands=islands), apart
 
 

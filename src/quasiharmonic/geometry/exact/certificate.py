@@ -187,7 +187,12 @@ class Certificate(ReadOnly, Displayable, Verdict):
 
 
 def certify(
-    F: IntArray, uv: FloatArray, *, boundary: bool = True, loops: Sequence[IntArray] | None = None
+    F: IntArray,
+    uv: FloatArray,
+    *,
+    boundary: bool = True,
+    loops: Sequence[IntArray] | None = None,
+    numbers: IntArray | None = None,
 ) -> Certificate:
     """Verify exactly whether a map is injective and bijective; `quasiharmonic.certify` converts and checks its input.
 
@@ -201,22 +206,26 @@ def certify(
         Whether to check the boundary, too.
     loops : sequence of (l,) int64, optional
         The boundary loops of ``F``, at least one if there are triangles; not checked.
+    numbers : (f,) int64, optional
+        Ascending numbers of the triangles in the certificate; by default their rows.
     """
     F, uv = make_unchangeable(F), make_unchangeable(uv)
+    numbers = np.arange(len(F)) if numbers is None else numbers
     sign, nonfinite = triangle_signs(F, uv)
+    nonfinite = numbers[nonfinite]
     inverted = degenerate = _none()
     reasons: list[Reason] = []
     if not len(F):
         reasons.append(Reason(Obstacle.NO_TRIANGLES, "there are no triangles"))
     elif sign.min() <= 0:
-        inverted = np.flatnonzero(sign < 0)
-        degenerate = np.setdiff1d(np.flatnonzero(sign == 0), nonfinite, assume_unique=True)
+        inverted = numbers[sign < 0]
+        degenerate = np.setdiff1d(numbers[sign == 0], nonfinite, assume_unique=True)
         text = f"of {len(F)} triangles, {_count_by_kind(inverted, degenerate, nonfinite)}"
         reasons.append(Reason(Obstacle.NOT_INJECTIVE, text))
     known: list[IntArray] = []
     crossings, multiply_wound = _none().reshape(0, 4), _none()
     if boundary and len(F):
-        known, defects = _find_loops(F, len(uv)) if loops is None else (list(loops), [])
+        known, defects = _find_loops(F, len(uv), numbers) if loops is None else (list(loops), [])
         reasons += defects
         # If all triangles are positive and the only loop is simple, the loop encloses the sum of their areas. So it
         # runs counterclockwise and winds once around its inside, and no further test is needed.
@@ -262,12 +271,12 @@ def _count_by_kind(inverted: IntArray, degenerate: IntArray, nonfinite: IntArray
     )
 
 
-def _find_loops(F: IntArray, n: int) -> tuple[list[IntArray], list[Reason]]:
+def _find_loops(F: IntArray, n: int, numbers: IntArray) -> tuple[list[IntArray], list[Reason]]:
     """Boundary loops, or the reasons why there are no valid loops."""
     parts, repeated = edges(F, n), _none()
     # An edge from a vertex to itself is never interior, so only the other kinds of edges need a test.
     if any((some[:, 0] == some[:, 1]).any() for some in (parts.boundary, parts.inconsistent, parts.nonmanifold)):
-        repeated = np.flatnonzero(are_collapsed(F))
+        repeated = numbers[are_collapsed(F)]
     wrong = (
         (repeated.tolist(), "triangles repeat a vertex"),
         (_edge_names(parts.nonmanifold), "edges are in three or more triangles"),

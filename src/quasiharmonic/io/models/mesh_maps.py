@@ -112,6 +112,12 @@ def _is_flat(mesh: MeshData) -> bool:
     return is_planar(mesh.V) or (not used.all() and bool(used.any()) and is_planar(mesh.V[used]))
 
 
+def find_unmapped(mesh: MeshData) -> IntArray:
+    """Return the faces, ascending, without texture coordinates at a corner; none if the mesh has none at all."""
+    bare = np.zeros(0, dtype=np.int64) if mesh.FT is None else np.flatnonzero((mesh.FT < 0).any(axis=1))
+    return np.unique(mesh.rings.of_triangle[bare])
+
+
 def check_mapped(mesh: MeshData) -> None:
     """Raise `MeshFileError` if a mesh has no map, or has it on some faces only."""
     if mesh.FT is None:
@@ -122,7 +128,7 @@ def check_mapped(mesh: MeshData) -> None:
                 remedy="export it with uv coordinates",
             )
         return
-    bare = np.unique(mesh.rings.of_triangle[(mesh.FT < 0).any(axis=1)])
+    bare = find_unmapped(mesh)
     if bare.size:
         raise MeshFileError(
             mesh.source,

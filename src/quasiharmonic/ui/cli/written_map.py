@@ -30,11 +30,12 @@ class WrittenMap:
     """Exact certificate of a file's map."""
 
     V: NDArray[np.float64]  # (m, 3)
-    F: NDArray[np.int64]  # (f, 3)
+    F: NDArray[np.int64]  # (f, 3); zero for triangles of unmapped faces
     uv: NDArray[np.float64]  # (m, 2): the mesh and its map, cut at seams: one vertex per texture coordinate of a vertex
     certificate: Certificate  # Certificate of the whole map in the plane
     verdict: AtlasVerdict | None  # Certificates of the islands; None for a single island
     faces: int  # Number of faces in the file
+    unmapped: NDArray[np.int64]  # Faces without texture coordinates at a corner, which are not verified
     bent: NDArray[np.int64]  # Faces with inverted triangles for a reader that splits faces at their first corner
     set_apart: SetApart | None = None  # Triangles that the verdict reverses or leaves out; None if there are none
 
@@ -69,9 +70,14 @@ class WrittenMap:
 
     def summary(self) -> str:
         """Return the verdict in sentences."""
+        from quasiharmonic.util.arrays import names_of
+
         text = self.certificate.summary() if self.verdict is None else self.verdict.summary()
-        if self.faces < len(self.F):
-            text += f"\nThe verdict is on the {len(self.F)} triangles that stand for its {self.faces} faces."
+        if self.unmapped.size:
+            where = names_of("face", "faces", self.unmapped)
+            text += f"\nThe verdict is on the other faces, because there are no texture coordinates on {where}."
+        if (faces := self.faces - len(self.unmapped)) < self.certificate.triangles:
+            text += f"\nThe verdict is on the {self.certificate.triangles} triangles that stand for its {faces} faces."
         if self.bent.size:
             text += f"\n{describe_bent(self.bent)}"
         return text if self.set_apart is None else f"{text}\n{self.set_apart.summary()}"
@@ -84,13 +90,14 @@ class WrittenMap:
             **as_plain(self.certificate, "inverted", "degenerate"),
             **as_plain(self, "faces", "certificate"),
             **({"verdict": apart} if apart else {}),
+            "unmapped_faces": self.unmapped.tolist(),
             "bent_faces": self.bent.tolist(),
             **({} if self.set_apart is None else self.set_apart.to_dict()),
         }
 
 
 def certify_map(mesh: MeshData, *, precision: str = "float64", weld: bool | float = False) -> WrittenMap:
-    """Certify the map of a file, optionally rounded to ``precision`` "float32".
+    """Certify the map of a file on the faces that have it, optionally rounded to ``precision`` "float32".
 
     ``weld`` is as in `SeamedMesh.weld`: vertices are welded where they are at one position in the plane.
     """
@@ -100,25 +107,32 @@ def certify_map(mesh: MeshData, *, precision: str = "float64", weld: bool | floa
     from quasiharmonic.apps.atlas.atlas_verdict import certify as certify_islands
     from quasiharmonic.geometry.exact.certificate import certify
     from quasiharmonic.geometry.mesh.topology import components
+    from quasiharmonic.io.models.mesh_maps import find_unmapped
     from quasiharmonic.io.seamed_mesh import SeamedMesh
 
-    joined = io.mapped(mesh).weld(weld)
-    opened = joined.opened()
-    V, F, uv = opened.V, opened.F, opened.uv
+    unmapped = find_unmapped(mesh)
+    rows = np.flatnonzero(~np.isin(mesh.rings.of_triangle, unmapped))
+    whole = SeamedMesh(mesh.V, mesh.F, mesh.FT, mesh.vt) if unmapped.size else io.mapped(mesh)
+    joined = whole.weld(weld)
+    opened = SeamedMesh(joined.V, joined.F[rows], joined.FT[rows], joined.uv).opened()
+    V, uv = opened.V, opened.uv
     assert uv is not None
     if precision == "float32":
         with np.errstate(over="ignore"):
             uv = uv.astype(np.float32).astype(np.float64)
+    F, FT = np.zeros_like(mesh.F), np.full_like(mesh.F, -1)
+    F[rows] = FT[rows] = opened.F
     # The components of the mesh cut at its seams are the islands.
-    part = components(F, len(V))[F[:, 0]]
+    part = components(opened.F, len(V))[opened.F[:, 0]]
     alone = bool((part == part[:1]).all())
-    verdict = None if alone else certify_islands(SeamedMesh(V, F, F, uv))
-    found = WrittenMap(V, F, uv, certify(F, uv), verdict, mesh.faces, find_bent(mesh, F, uv))
+    verdict = None if alone else certify_islands(SeamedMesh(V, F, FT, uv))
+    bent = np.setdiff1d(find_bent(mesh, F, uv), unmapped)
+    found = WrittenMap(V, F, uv, certify(opened.F, uv, numbers=rows), verdict, mesh.faces, unmapped, bent)
     if found.certificate.injective or mesh.vt is None:
         return found
     from quasiharmonic.apps.unwrapping.chart_verdict import certify_defective
 
-    charts = certify_defective(mesh.V, joined.F, uv[F])
+    charts = certify_defective(mesh.V, joined.F[rows], uv[opened.F], rows)
     return found if charts is None else replace(found, verdict=charts[0], set_apart=charts[1])
 
 

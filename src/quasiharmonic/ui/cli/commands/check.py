@@ -1,12 +1,13 @@
 """``qhm check``: say what a mesh is, certify its map exactly, and find what prevents a map.
 
 Report the components, boundaries, genus and defects of a mesh. If the file has a map (vt of an OBJ; a planar mesh
-without vt is its own map), verify it exactly. A map with seams is verified in the plane. Tetrahedra are verified in
-space. If the map is not injective, look for obstructions: conditions that no map with these fixed vertices meets.
+without vt is its own map), verify it exactly. A map with seams is verified in the plane. If some faces have no texture
+coordinates, the other faces are verified. Tetrahedra are verified in space. If the map is not injective, look for
+obstructions: conditions that no map with these fixed vertices meets.
 
-Exit status: 0 every island of the map is injective (every triangle strictly positive; of several islands some may be
-mirrored), or there is no map and the mesh has no defect, or the boundary is listed; 1 otherwise; 2 the file cannot be
-read.
+Exit status: 0 every island of the map is injective (every triangle with texture coordinates strictly positive; of
+several islands some may be mirrored), or there is no map and the mesh has no defect, or the boundary is listed; 1
+otherwise; 2 the file cannot be read.
 
     qhm check model.obj
     qhm check problem/ --json report.json
@@ -141,19 +142,21 @@ def _verify(
         facts["not_convex"] = bent.tolist()
         good = good and not bent.size
         lines.append(text)
-    # The diagnosis would name vertices of the mesh without welding.
-    diagnosis = None if good or len(found.welded) else _diagnose(mesh, fixed)
+    # The diagnosis would name vertices of the mesh without welding, and needs all faces.
+    diagnosis = None if good or len(found.welded) or certified.unmapped.size else _diagnose(mesh, fixed)
     facts["diagnosis"] = None if diagnosis is None else diagnosis.to_dict()
     return good, facts, lines if diagnosis is None else [*lines, diagnosis.summary()]
 
 
 def _describe_gaps(certified: WrittenMap) -> list[str]:
     """Return a sentence on the smallest distance between islands in the unit square that do not overlap."""
+    import numpy as np
+
     from quasiharmonic.apps.unwrapping.chart_verdict import measure_clearance
     from quasiharmonic.geometry.mesh.topology import components
 
     uv = certified.uv
-    if certified.verdict is None or not certified.apart or uv.min() < 0 or uv.max() > 1:
+    if certified.verdict is None or not certified.apart or np.nanmin(uv) < 0 or np.nanmax(uv) > 1:
         return []
     gap = measure_clearance(certified.certificate.loops, uv * _RESOLUTION, components(certified.F, len(uv)), reach=_FAR)
     apart = f"at least {gap:.3g}" if gap < float("inf") else f"more than {_FAR}"
@@ -162,16 +165,18 @@ def _describe_gaps(certified: WrittenMap) -> list[str]:
 
 def _convexity(mesh: MeshData, certified: WrittenMap) -> tuple[NDArray[np.int64], str]:
     """Return the faces that are not convex in the plane, and a sentence about them."""
+    import numpy as np
+
     from quasiharmonic.geometry.exact.triangles import find_concave
     from quasiharmonic.util.arrays import count_of, names_of
 
-    bent = find_concave(mesh.rings, certified.F, certified.uv)
+    bent = np.setdiff1d(find_concave(mesh.rings, certified.F, certified.uv), certified.unmapped)
     if bent.size:
         return (
             bent,
             f"Not injective for every triangulation: {names_of('face', 'faces', bent)} not convex in the plane.",
         )
-    faces = count_of("face", "faces", mesh.faces)
+    faces = count_of("face", "faces", mesh.faces - len(certified.unmapped))
     return bent, f"Every one of {faces} is convex in the plane: the result holds for any triangulation."
 
 
