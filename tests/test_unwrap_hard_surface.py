@@ -289,6 +289,31 @@ def test_rings_of_a_torus_with_twelve_sides_stay_together(around):
     assert result.n_charts <= 4
 
 
+@pytest.mark.parametrize("sides", [6, 8, 10])
+def test_tori_with_few_sides_have_few_charts_that_fill_the_texture(sides):
+    mesh = torus(4 * sides, sides)
+    result = unwrap(*mesh)
+    assert result.success
+    assert result.n_charts <= 4
+    assert result.utilisation > 0.55
+    # Rings that must be charts, or with little stretch, are unrolled without stretch.
+    for options in ({"hard_edges": 30}, {"max_stretch": 1.1}):
+        assert unwrap(*mesh, **options).stretch.worst < 1.01
+
+
+def test_tubes_with_chamfers_are_no_tori():
+    angle = 2 * np.pi * np.arange(32) / 32
+    profile = np.array(
+        [[1.3, 0.2], [1.2, 0.3], [0.8, 0.3], [0.7, 0.2], [0.7, -0.2], [0.8, -0.3], [1.2, -0.3], [1.3, -0.2]]
+    )
+    V = np.concatenate([np.stack([r * np.cos(angle), r * np.sin(angle), 0 * angle + z], axis=1) for r, z in profile])
+    i, j = (index.ravel() for index in np.indices((8, 32)))
+    a, b = 32 * i + j, 32 * i + (j + 1) % 32
+    c, d = (b + 32) % 256, (a + 32) % 256
+    F = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    assert unwrap(V, F).stretch.worst < 1.01
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [5, 11, 40])
 def test_moebius_bands_are_cut_open(n):

@@ -198,7 +198,7 @@ def test_edges_that_cannot_be_kept_together_are_named():
 @pytest.mark.slow
 def test_seams_between_labels_cost_nothing():
     V, F = MODELS["torus"]
-    labels = (V[F].mean(axis=1)[:, 0] > 0).astype(int) + 7
+    labels = (V[F].mean(axis=1)[:, 0] > 0.5).astype(int) + 7
     edges = all_edges(F[labels == 7])
     between = edges[np.array(are_among(edges, all_edges(F[labels == 8])))]
     plain, result = (unwrap(V, F, resolution=256, labels=given) for given in (None, labels))

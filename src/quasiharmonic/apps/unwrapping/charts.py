@@ -100,7 +100,7 @@ def find_charts(
     demanded = cost <= DEMANDED_COST
     given = _ends(F, demanded) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
     if uv_cuts is None:
-        exact, charts = _develop(V, F, cost, max_charts, choose, workers, mirror)
+        exact, charts = _develop(V, F, cost, max_stretch, max_charts, choose, workers, mirror)
         working, rest = list[WorkingChart](), np.flatnonzero(~exact)
     else:
         exact, charts = _lay_flat(V, F, given)
@@ -171,6 +171,7 @@ def _develop(
     V: FloatArray,
     F: IntArray,
     cost: FloatArray,
+    max_stretch: float,
     max_charts: int | None,
     choose: LayoutChoice | None,
     workers: Workers,
@@ -183,7 +184,9 @@ def _develop(
     if not rows.size:
         return mask, charts
     own_mirror = None if mirror is None else mirror.select(rows)
-    developed, more = develop_charts(V, F[rows], cost[rows], choose, workers.check_wanted, own_mirror)
+    developed, more = develop_charts(
+        V, F[rows], cost[rows], choose, workers.check_wanted, own_mirror, max_stretch=max_stretch
+    )
     left = np.inf if max_charts is None else max_charts - len(charts) - len(more)
     if int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1 <= left:
         charts += [replace(chart, triangles=rows[chart.triangles]) for chart in more]

@@ -65,6 +65,8 @@ def develop_charts(
     choose: LayoutChoice | None,
     check_wanted: Callable[[], object],
     mirror: Mirror | None = None,
+    *,
+    max_stretch: float = 1.0,
 ) -> tuple[BoolArray, list[Chart]]:
     """Unroll the developable pieces of a surface, and join them to charts without stretch.
 
@@ -82,6 +84,8 @@ def develop_charts(
         Called now and then; may raise an exception.
     mirror : Mirror, optional
         Mirror images, if seams and charts are to be mirrored.
+    max_stretch : float
+        As in `find_pieces`.
 
     Returns
     -------
@@ -92,7 +96,7 @@ def develop_charts(
     """
     hinges = find_hinges(V, F)
     demanded = hinges.touch(cost <= DEMANDED_COST)
-    pieces = find_pieces(V, F, hinges, cost, mirror)
+    pieces = find_pieces(V, F, hinges, cost, mirror, max_stretch=max_stretch)
     if not pieces.count:
         return pieces.label >= 0, []
     area, weight = surface_area(V, F), hinges.price(cost)

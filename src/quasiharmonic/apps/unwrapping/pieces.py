@@ -19,7 +19,7 @@ from quasiharmonic.apps.unwrapping.unrolling import covers_once, find_forest, la
 from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes, surface_area
 from quasiharmonic.geometry.mesh.splitting import fans
-from quasiharmonic.geometry.mesh.topology import boundary_loops
+from quasiharmonic.geometry.mesh.topology import boundary_loops, label_components
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at
 from quasiharmonic.util.progress import heartbeat
 
@@ -47,6 +47,12 @@ class PieceTuning(NamedTuple):
     rough: float = 0.5
     # But pieces between creases with at least this share are kept in any case.
     large_share: float = 0.2
+    # The rings of a torus with at least six sides: largest angle of the creases between two of them, in degrees,
+    # and largest ratio of their widths.
+    torus_crease: float = 65.0
+    torus_widths: float = 1.25
+    # Smallest bound on the stretch at which such a torus needs fewer charts than its rings.
+    torus_stretch: float = 1.35
     # Curved parts are divided at these angles, smaller than `CREASE`; in degrees.
     angles: tuple[float, ...] = (20.0, 13.0, 9.0, 6.0, 4.0)
     # There, a piece has at least this share.
@@ -173,7 +179,50 @@ def _drop_scattered(parts: _Parts, chosen: BoolArray, rim: FloatArray) -> BoolAr
         chosen = kept
 
 
-def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mirror: Mirror | None = None) -> Pieces:
+def find_coarse_tori(
+    V: FloatArray, F: IntArray, hinges: Hinges, max_stretch: float, apart: BoolArray | None = None
+) -> BoolArray:
+    """Return the triangles (f,) of tori with few sides, which count as curved at this bound on the stretch.
+
+    Between creases, a torus with six to eleven sides consists of rings. Each ring is developable, but unrolled rings
+    use the texture badly. Cut along and across, the torus needs few charts with little stretch. In contrast, the
+    chamfer of a tube is narrower than its neighbours. If all creases are ``apart`` (e,), the rings are charts anyway.
+    """
+    if max_stretch < _TUNING.torus_stretch:
+        return np.zeros(len(F), dtype=np.bool_)
+    size = np.abs(hinges.angle)
+    crease = (size > CREASE) & ~hinges.flat
+    surface = label_components(hinges.first, hinges.second, len(F))
+    # The number of hinges of a closed surface is 3/2 of the number of its triangles.
+    sides, inner = (np.bincount(surface[of], minlength=len(F)) for of in (np.arange(len(F)), hinges.first))
+    good = mark(len(F), surface[hinges.first[crease if apart is None else crease & ~apart]]) & (3 * sides == 2 * inner)
+    for wrong in (size > np.deg2rad(_TUNING.torus_crease), crease & (hinges.angle < 0)):
+        good[surface[hinges.first[wrong]]] = False
+    if not good.any():
+        return np.zeros(len(F), dtype=np.bool_)
+    split, ring = fans(F, pairs=(hinges.one[~crease], hinges.other[~crease]))
+    count, pair = int(ring.max()) + 1, np.stack([ring[hinges.first], ring[hinges.second]])
+    of = np.empty(int(split.max()) + 1, dtype=np.int64)
+    of[split] = ring[:, None]
+    # Vertices, less edges, plus triangles: 0 for a ring.
+    euler = np.bincount(of) - 2 * np.bincount(ring) + np.bincount(pair[0, ~crease], minlength=count)
+    good[surface[(euler != 0)[ring]]] = False
+    rim = np.bincount(pair[:, crease].ravel(), np.tile(hinges.length[crease], 2), count)
+    width = np.bincount(ring, rest_shapes(V, F).m, count) / np.maximum(rim, np.finfo(float).tiny)
+    low, high = np.sort(width[pair[:, crease]], axis=0)
+    good[surface[hinges.first[crease][high > _TUNING.torus_widths * low]]] = False
+    return good[surface]
+
+
+def find_pieces(
+    V: FloatArray,
+    F: IntArray,
+    hinges: Hinges,
+    cost: FloatArray,
+    mirror: Mirror | None = None,
+    *,
+    max_stretch: float = 1.0,
+) -> Pieces:
     """Find developable pieces and unroll them.
 
     Parameters
@@ -186,6 +235,8 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
         and are apart at factors of at most `DEMANDED_COST`.
     mirror : Mirror, optional
         Mirror images; the cuts of tubes and cones are then mirrored, and lie on the plane where possible.
+    max_stretch : float
+        Bound on the stretch of curved parts; see `find_coarse_tori`.
     """
     together, apart = hinges.touch(cost >= UNDIVIDED_COST), hinges.touch(cost <= DEMANDED_COST)
     shapes = rest_shapes(V, F)
@@ -193,9 +244,10 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
     angles, whole = corner_angles(shapes.sides), surface_area(V, F)
     length = np.linalg.norm(V[F] - V[np.roll(F, -1, axis=1)], axis=2)
     found = Pieces(np.full(len(F), -1), np.zeros(F.shape, dtype=np.complex128), np.zeros(hinges.one.size, dtype=bool))
+    torus = find_coarse_tori(V, F, hinges, max_stretch, apart)
     for angle in (CREASE, *np.deg2rad(_TUNING.angles), 0.0):
         heartbeat()
-        rest = found.label < 0
+        rest = (found.label < 0) & ~torus
         within = ~apart & rest[hinges.first] & rest[hinges.second]
         # What is left between pieces can be developable as a whole, with its creases.
         joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat | together) if angle else within
@@ -210,7 +262,7 @@ def find_pieces(V: FloatArray, F: IntArray, hinges: Hinges, cost: FloatArray, mi
             chosen &= (parts.area >= _TUNING.min_share) & (rim**2 <= _TUNING.max_perimeter * parts.area * whole)
         if chosen.any():
             _unroll(V, parts, chosen, cost, found, mirror)
-        if (found.label >= 0).all():
+        if (torus | (found.label >= 0)).all():
             break
     return found
 

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, find_hinges
 from quasiharmonic.apps.unwrapping.layout import find_differing_sides
-from quasiharmonic.apps.unwrapping.pieces import CREASE, find_pieces
+from quasiharmonic.apps.unwrapping.pieces import CREASE, find_coarse_tori, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror, Symmetry, find_mirror
 from quasiharmonic.geometry.mesh.reference import area_vectors
 from quasiharmonic.geometry.mesh.splitting import fans
@@ -125,7 +125,8 @@ def find_rules(
         if options.symmetry is not None and (plain or options.symmetry != "auto"):
             mirror, symmetry = find_mirror(points, cleaned.F, options.symmetry)
         if not options.divide_for_packing:
-            whole = hinges.flat & ~_find_smooth_rings(cleaned.F, hinges)
+            torus = find_coarse_tori(points, cleaned.F, hinges, options.max_stretch)
+            whole = hinges.flat & ~_find_smooth_rings(cleaned.F, hinges) & ~torus[hinges.first]
             cost[hinges.mark_sides(whole, len(cleaned.F))] *= UNDIVIDED_COST
         demanded |= _mark_hard_edges(options.hard_edges, hinges, cleaned, F) & ~kept
     if options.up is not None:
