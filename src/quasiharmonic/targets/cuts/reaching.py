@@ -5,8 +5,8 @@ of cut. A loose end in the interior counts as extra length, to avoid many short 
 
 A cut is made first and then evaluated. The scale is largest at the tip of a limb. A cut from the existing cuts to this
 tip is kept if the price decreases. (Gu, Gortler and Hoppe [1]_ cut to where a map stretches most, whatever the cost.)
-Then stretches are exchanged for shorter ones as long as the price decreases. Finally, cuts of limbs that another cut
-now reaches are removed. Each of these steps can enable the others, so they are repeated for a few rounds.
+Then stretches are exchanged for shorter ones as long as the price decreases. Each of these two steps can enable the
+other, so they are repeated.
 
 References
 ----------
@@ -22,7 +22,7 @@ import numpy as np
 
 from quasiharmonic.linsolve import make_solver
 from quasiharmonic.targets.cuts.graph import EdgeGraph
-from quasiharmonic.targets.cuts.shortening import shorten_cuts, stretches
+from quasiharmonic.targets.cuts.shortening import shorten_cuts
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
 
@@ -52,7 +52,7 @@ def extend_cuts(graph: EdgeGraph, cut: BoolArray, min_gain: float) -> BoolArray:
     if not balance.shrinking.area.any():
         return cut
     for _ in range(_ROUNDS):
-        tried = balance.prune(shorten_cuts(graph, balance.extend(cut), balance.price))
+        tried = shorten_cuts(graph, balance.extend(cut), balance.price)
         if not balance.price(tried) < balance.price(cut):
             break
         cut = tried
@@ -127,24 +127,6 @@ class _Balance:
         """Cost of the cheapest path to each vertex from the boundary or a cut, and its predecessor on the path."""
         opened = np.flatnonzero(self._rim | self.graph.mark_vertices(cut))
         return self.graph.distances(opened, self.graph.cost)
-
-    def prune(self, cut: BoolArray) -> BoolArray:
-        """Remove stretches to loose ends that raise the price, shortest first."""
-        kept = set[bytes]()
-        while fresh := [way for way in self._twigs(cut) if way.tobytes() not in kept]:
-            way = min(fresh, key=lambda way: (self.graph.length[way].sum(), way[0]))
-            kept.add(way.tobytes())
-            shorter = cut.copy()
-            shorter[way] = False
-            if (shorter.any() or self._rim.any()) and self.price(shorter) < self.price(cut):
-                cut = shorter
-        return cut
-
-    def _twigs(self, cut: BoolArray) -> list[IntArray]:
-        """Return the stretches with a loose end."""
-        loose = self._mark_loose_ends(cut)
-        ways = stretches(self.graph, cut)
-        return [way for way in ways if loose[self.graph.ends[way[[0, -1]]]].any()]
 
 
 class Shrinking:
