@@ -134,6 +134,27 @@ def test_sets_of_cells_and_of_several_attributes(tmp_path):
     assert set(read_fem(tmp_path / "a.mesh").find_set("both")) == set(RIM)
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "own", "kinds"),
+    [
+        ("a.msh", gmsh22().replace('"fluid"', '"the body"'), "the body", ("point", "surface")),
+        ("b.msh", gmsh22().replace(" 2 2 9 ", " 2 2 8 "), "8", ("point", "surface")),
+        ("a.vtk", vtk().replace("first", "part"), "part=1", ("point", "cell")),
+        ("a.mesh", mfem() + '\nattribute_sets\n1\n"the body" 1 5\n', "the body", ("boundary", "elements")),
+    ],
+)
+def test_groups_with_the_same_name(tmp_path, name, text, own, kinds):
+    (tmp_path / name).write_text(text)
+    mesh = read_fem(tmp_path / name)
+    first, second = (f"{kind}:{own}" for kind in kinds)
+    with pytest.raises(MeshFileError, match=f"several groups are called '{own}'; use '{first}' or '{second}'"):
+        mesh.find_set(own)
+    with pytest.raises(MeshFileError, match=f"available: .*'{first}'.*, '{second}'"):
+        mesh.find_set("nose")
+    np.testing.assert_array_equal(mesh.find_set(first), WALLS if own == "8" else BODY)
+    np.testing.assert_array_equal(mesh.find_set(second), np.unique(F[0]) if name == "a.vtk" else np.unique(F))
+
+
 def call(tmp_path, *options, name="a.mesh"):
     (tmp_path / name).write_text(FILES[name][0]())
     out = tmp_path / f"out_{name}"

@@ -28,6 +28,7 @@ _DIMENSIONS = {
     **dict.fromkeys(_SURFACES, 2),
     **dict.fromkeys(_SOLIDS, 3),
 }
+_GROUP_KINDS = "point", "curve", "surface", "volume"
 # Sections of the entities of version 4. In a mesh that was partitioned, elements belong to those of the second.
 _ENTITIES = b"Entities", b"PartitionedEntities"
 # Elements of a kind: the kind, the physical group (version 2) or entity (version 4) of each, and the tags of the nodes.
@@ -225,7 +226,7 @@ def _find_sets(
     blocks: list[_Block],
     tags: tuple[IntArray, IntArray],
 ) -> dict[str, IntArray]:
-    """Return the nodes of the physical groups by name, or by number without a name.
+    """Return the nodes of the physical groups by dimension and name, or number without a name.
 
     ``tags`` are the sorted tags of the nodes, and the nodes in this order.
     """
@@ -243,13 +244,14 @@ def _find_sets(
                 groups |= _groups_of_entities(data, spans[section], version, order, section != _ENTITIES[0])
     found: dict[str, list[IntArray]] = {}
     for kind, numbers, nodes in blocks:
+        dimension = _DIMENSIONS[kind]
         for number in np.unique(numbers).tolist():
             own = nodes[numbers == number].ravel()
             where = tags[1][np.searchsorted(tags[0], own).clip(max=len(tags[0]) - 1)]
-            for group in ([number] * (number != 0)) if groups is None else groups.get((_DIMENSIONS[kind], number), ()):
+            for group in ([number] * (number != 0)) if groups is None else groups.get((dimension, number), ()):
                 # The sign of a group in version 4 is the orientation of its elements.
-                name = names.get((_DIMENSIONS[kind], abs(group)), str(abs(group)))
-                found.setdefault(name, []).append(where)
+                name = names.get((dimension, abs(group)), str(abs(group)))
+                found.setdefault(f"{_GROUP_KINDS[dimension]}:{name}", []).append(where)
     return {name: np.unique(np.concatenate(parts)) for name, parts in found.items()}
 
 
