@@ -287,6 +287,18 @@ def test_errors_in_vtu_files_are_described(tmp_path, data, message):
         mesh.point_field("u", [0])
 
 
+def test_arrays_beside_a_group_in_a_vtu_file(tmp_path):
+    path = tmp_path / "a.vtu"
+    flag = b'<PointData><DataArray type="Int32" Name="flag" format="ascii">0 1 0 1</DataArray>'
+    names = b'<CellData><DataArray type="String" Name="who" format="ascii">97 0 98 0</DataArray></CellData>'
+    data = vtu("ascii").replace(b"<PointData>", flag).replace(b"</Piece>", names + b"</Piece>")
+    path.write_bytes(data)
+    assert read_fem(path).find_set("flag").tolist() == [1, 3]
+    path.write_bytes(data.replace(b"String", b"Int32"))
+    with pytest.raises(MeshFileError, match="the array 'who' has 4 numbers, not 2"):
+        read_fem(path).find_set("flag")
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("coder", [ZLIB, LZMA], ids=["zlib", "lzma"])
 @pytest.mark.parametrize("form", ["inline", "raw"])

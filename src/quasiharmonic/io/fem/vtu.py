@@ -87,7 +87,11 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
     starts = np.concatenate([[0], ends])
     F = select_elements(connectivity, starts, kinds, len(place), solid)
     fields, of_cells = (
-        {name: partial(_rows, file, array, count) for name, array in file.last_arrays(parent).items()}
+        {
+            name: partial(_rows, file, array, count)
+            for name, array in file.last_arrays(parent).items()
+            if array.attributes.get("type") in _KINDS
+        }
         for parent, count in (("PointData", file.points), ("CellData", file.cells))
     )
     return MeshParts(
@@ -102,7 +106,11 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
 
 def _rows(file: _VtuFile, array: _Array, count: int) -> FloatArray:
     components = int(array.attributes.get("NumberOfComponents", "1"))
-    return file.values(array, count * components).astype(np.float64).reshape(-1, components)
+    values = file.values(array, count * components)
+    if len(values) != count * components:
+        name = array.attributes.get("Name", "")
+        raise ValueError(f"the array {name[:40]!r} has {len(values)} numbers, not {count * components}")
+    return values.astype(np.float64).reshape(-1, components)
 
 
 class _VtuFile:
