@@ -126,6 +126,7 @@ class _VtuFile:
         self._open: tuple[dict[str, str], int] | None = None
         self._file: dict[str, str] = {}
         self._pieces: list[dict[str, str]] = []
+        self._in_empty_piece = False
         tag = _APPENDED.search(data)
         # Appended data need not be XML, so parse only the part before.
         head = data if tag is None else data[: tag.end()] + b"</AppendedData></VTKFile>"
@@ -209,7 +210,8 @@ class _VtuFile:
         if name == "VTKFile":
             self._file = attributes
         elif name == "Piece":
-            self._pieces += [attributes] * (attributes.get("NumberOfPoints") != "0")
+            self._in_empty_piece = attributes.get("NumberOfPoints") == "0"
+            self._pieces += [attributes] * (not self._in_empty_piece)
         elif name in ("DataArray", "Array"):
             self._open = attributes, self._parser.CurrentByteIndex
         self._path.append(name)
@@ -223,7 +225,8 @@ class _VtuFile:
             # Child elements with further information may follow the numbers.
             array = _Array(attributes, tag, begin, self._data.find(b"<", begin))
             self._all.append(array)
-            self._arrays.setdefault((self._path[-1], attributes.get("Name", "")), []).append(array)
+            if not self._in_empty_piece:
+                self._arrays.setdefault((self._path[-1], attributes.get("Name", "")), []).append(array)
             self._open = None
 
     def _block(self, array: _Array, max_bytes: int) -> tuple[bytes, int, int]:
