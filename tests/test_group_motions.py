@@ -155,6 +155,12 @@ def test_groups_with_the_same_name(tmp_path, name, text, own, kinds):
     np.testing.assert_array_equal(mesh.find_set(second), np.unique(F[0]) if name == "a.vtk" else np.unique(F))
 
 
+def test_empty_groups_are_not_listed(tmp_path):
+    (tmp_path / "a.vtk").write_text(vtk().replace("\n1 0", "\n0 0"))
+    with pytest.raises(MeshFileError, match="no group 'first'; available: 'part', .*, 'part=2', 'first=0'"):
+        read_fem(tmp_path / "a.vtk").find_set("first")
+
+
 def call(tmp_path, *options, name="a.mesh"):
     (tmp_path / name).write_text(FILES[name][0]())
     out = tmp_path / f"out_{name}"

@@ -67,7 +67,7 @@ class FemMesh:
         sets have the name without it.
         """
         with report_damage(self.source, "the groups cannot be read: ", _DAMAGE):
-            sets = self.parts.find_sets()
+            sets = {full: nodes for full, nodes in self.parts.find_sets().items() if nodes.size}
         names = {full: full.partition(":")[2] for full in sets}
         wanted = [name] if name in sets else [full for full in sets if names[full] == name]
         if len(wanted) > 1:
