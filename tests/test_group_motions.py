@@ -155,6 +155,11 @@ def test_groups_with_the_same_name(tmp_path, name, text, own, kinds):
     np.testing.assert_array_equal(mesh.find_set(second), np.unique(F[0]) if name == "a.vtk" else np.unique(F))
 
 
+def test_names_with_quotes(tmp_path):
+    (tmp_path / "a.msh").write_text(gmsh22().replace("the body", 'the "body"'))
+    np.testing.assert_array_equal(read_fem(tmp_path / "a.msh").find_set('the "body"'), BODY)
+
+
 def test_empty_groups_are_not_listed(tmp_path):
     (tmp_path / "a.vtk").write_text(vtk().replace("\n1 0", "\n0 0"))
     with pytest.raises(MeshFileError, match="no group 'first'; available: 'part', .*, 'part=2', 'first=0'"):

@@ -77,7 +77,7 @@ def read_gmsh(data: bytes, solid: bool = False) -> MeshParts:
         elif name == b"NodeData":
             title = TableReader(data, begin, end, "<")
             if int(title.read_words()[0]) > 0:
-                later.setdefault(title.read_line().strip(b'"').decode("utf-8", "replace"), []).append((begin, end))
+                later.setdefault(_decode_name(title.read_line()), []).append((begin, end))
     if not (nodes and elements):
         raise ValueError(f"there is no section ${'Elements' if nodes else 'Nodes'}")
     tags, numbers = nodes[0][0], elements[0]
@@ -218,6 +218,11 @@ def _element_lines(numbers: list[int], count: int, solid: bool) -> Iterator[_Blo
         yield kind, np.array(groups, dtype=np.int64), np.array(nodes, dtype=np.int64)
 
 
+def _decode_name(quoted: bytes) -> str:
+    """Return a name without its quotes; it may itself contain quotes."""
+    return quoted.removeprefix(b'"').removesuffix(b'"').decode("utf-8", "replace")
+
+
 def _find_sets(
     data: bytes,
     spans: dict[bytes, tuple[int, int]],
@@ -235,7 +240,7 @@ def _find_sets(
         for line in data[slice(*spans[b"PhysicalNames"])].split(b"\n")[1:]:
             words = line.strip().split(None, 2)
             if len(words) == 3:
-                names[int(words[0]), int(words[1])] = words[2].strip(b'"').decode("utf-8", "replace")
+                names[int(words[0]), int(words[1])] = _decode_name(words[2])
     groups: dict[tuple[int, int], list[int]] | None = None
     if version != "2":
         groups = {}
