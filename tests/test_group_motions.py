@@ -162,8 +162,20 @@ def test_names_with_quotes(tmp_path):
 
 def test_empty_groups_are_not_listed(tmp_path):
     (tmp_path / "a.vtk").write_text(vtk().replace("\n1 0", "\n0 0"))
-    with pytest.raises(MeshFileError, match="no group 'first'; available: 'part', .*, 'part=2', 'first=0'"):
+    with pytest.raises(
+        MeshFileError, match="no group 'first'; available: 'part', 'part=0', 'part=1', 'part=2', 'first=0'"
+    ):
         read_fem(tmp_path / "a.vtk").find_set("first")
+
+
+def test_a_group_without_elements(tmp_path, capsys):
+    count, edges = len(POINTS), len(RIM)
+    text = mfem().replace(f"boundary\n{edges}\n", f"boundary\n{edges + 1}\n3 1 {count} {count}\n") + "9 9\n"
+    (tmp_path / "a.mesh").write_text(text.replace(f"vertices\n{count}", f"vertices\n{count + 1}"))
+    motions = "--group", "2", "--group", "3", "--translate", "1,0"
+    assert main(["morph", str(tmp_path / "a.mesh"), "-o", str(tmp_path / "b.mesh"), *motions]) == 2
+    assert "no element uses a node of the group '3'; omit it" in capsys.readouterr().err
+    assert not (tmp_path / "b.mesh").exists()
 
 
 def call(tmp_path, *options, name="a.mesh"):
