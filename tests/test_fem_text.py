@@ -303,6 +303,7 @@ def test_arrays_beside_a_group_in_a_vtu_file(tmp_path):
     path = tmp_path / "a.vtu"
     flag = b'<PointData><DataArray type="Int32" Name="flag" format="ascii">0 1 0 1</DataArray>'
     names = b'<CellData><DataArray type="String" Name="who" format="ascii">97 0 98 0</DataArray></CellData>'
+    flag += b'<DataArray type="Int32" Name="none" NumberOfComponents="0" format="ascii"></DataArray>'
     data = vtu("ascii").replace(b"<PointData>", flag).replace(b"</Piece>", names + b"</Piece>")
     path.write_bytes(data)
     assert read_fem(path).find_set("flag").tolist() == [1, 3]

@@ -110,7 +110,7 @@ def _rows(file: _VtuFile, array: _Array, count: int) -> FloatArray:
     if len(values) != count * components:
         name = array.attributes.get("Name", "")
         raise ValueError(f"the array {name[:40]!r} has {len(values)} numbers, not {count * components}")
-    return values.astype(np.float64).reshape(-1, components)
+    return values.astype(np.float64).reshape(count, components)
 
 
 class _VtuFile:
