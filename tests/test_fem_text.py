@@ -287,6 +287,31 @@ def test_errors_in_vtu_files_are_described(tmp_path, data, message):
         mesh.point_field("u", [0])
 
 
+@pytest.mark.parametrize("form", ["ascii", "raw"])
+def test_an_empty_piece_in_a_vtu_file(tmp_path, form):
+    path, data = tmp_path / "a.vtu", vtu(form)
+    numbers = b'<DataArray type="Float64" Name="%b" NumberOfComponents="3" format="ascii"/>'
+    arrays = b"<PointData>%b</PointData><Points>%b</Points>" % (numbers % b"u", numbers % b"Points")
+    empty = b'<Piece NumberOfPoints="0" NumberOfCells="0">%b</Piece>' % arrays
+    path.write_bytes(data.replace(b"<Piece", empty + b"<Piece").replace(b"</Piece></U", b"</Piece>%b</U" % empty))
+    mesh, again = moved(path)
+    np.testing.assert_array_equal(mesh.points, POINTS[:, :2])
+    assert again.point_field("u", range(4)).tolist() == U[:, :2].tolist()
+
+
+def test_arrays_beside_a_group_in_a_vtu_file(tmp_path):
+    path = tmp_path / "a.vtu"
+    flag = b'<PointData><DataArray type="Int32" Name="flag" format="ascii">0 1 0 1</DataArray>'
+    names = b'<CellData><DataArray type="String" Name="who" format="ascii">97 0 98 0</DataArray></CellData>'
+    flag += b'<DataArray type="Int32" Name="none" NumberOfComponents="0" format="ascii"></DataArray>'
+    data = vtu("ascii").replace(b"<PointData>", flag).replace(b"</Piece>", names + b"</Piece>")
+    path.write_bytes(data)
+    assert read_fem(path).find_set("flag").tolist() == [1, 3]
+    path.write_bytes(data.replace(b"String", b"Int32"))
+    with pytest.raises(MeshFileError, match="the array 'who' has 4 numbers, not 2"):
+        read_fem(path).find_set("flag")
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("coder", [ZLIB, LZMA], ids=["zlib", "lzma"])
 @pytest.mark.parametrize("form", ["inline", "raw"])

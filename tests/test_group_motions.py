@@ -134,6 +134,50 @@ def test_sets_of_cells_and_of_several_attributes(tmp_path):
     assert set(read_fem(tmp_path / "a.mesh").find_set("both")) == set(RIM)
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "own", "kinds"),
+    [
+        ("a.msh", gmsh22().replace('"fluid"', '"the body"'), "the body", ("point", "surface")),
+        ("b.msh", gmsh22().replace(" 2 2 9 ", " 2 2 8 "), "8", ("point", "surface")),
+        ("a.vtk", vtk().replace("first", "part"), "part=1", ("point", "cell")),
+        ("a.mesh", mfem() + '\nattribute_sets\n1\n"the body" 1 5\n', "the body", ("boundary", "elements")),
+    ],
+)
+def test_groups_with_the_same_name(tmp_path, name, text, own, kinds):
+    (tmp_path / name).write_text(text)
+    mesh = read_fem(tmp_path / name)
+    first, second = (f"{kind}:{own}" for kind in kinds)
+    with pytest.raises(MeshFileError, match=f"several groups are called '{own}'; use '{first}' or '{second}'"):
+        mesh.find_set(own)
+    with pytest.raises(MeshFileError, match=f"available: .*'{first}'.*, '{second}'"):
+        mesh.find_set("nose")
+    np.testing.assert_array_equal(mesh.find_set(first), WALLS if own == "8" else BODY)
+    np.testing.assert_array_equal(mesh.find_set(second), np.unique(F[0]) if name == "a.vtk" else np.unique(F))
+
+
+def test_names_with_quotes(tmp_path):
+    (tmp_path / "a.msh").write_text(gmsh22().replace("the body", 'the "body"'))
+    np.testing.assert_array_equal(read_fem(tmp_path / "a.msh").find_set('the "body"'), BODY)
+
+
+def test_empty_groups_are_not_listed(tmp_path):
+    (tmp_path / "a.vtk").write_text(vtk().replace("\n1 0", "\n0 0"))
+    with pytest.raises(
+        MeshFileError, match="no group 'first'; available: 'part', 'part=0', 'part=1', 'part=2', 'first=0'"
+    ):
+        read_fem(tmp_path / "a.vtk").find_set("first")
+
+
+def test_a_group_without_elements(tmp_path, capsys):
+    count, edges = len(POINTS), len(RIM)
+    text = mfem().replace(f"boundary\n{edges}\n", f"boundary\n{edges + 1}\n3 1 {count} {count}\n") + "9 9\n"
+    (tmp_path / "a.mesh").write_text(text.replace(f"vertices\n{count}", f"vertices\n{count + 1}"))
+    motions = "--group", "2", "--group", "3", "--translate", "1,0"
+    assert main(["morph", str(tmp_path / "a.mesh"), "-o", str(tmp_path / "b.mesh"), *motions]) == 2
+    assert "no element uses a node of the group '3'; omit it" in capsys.readouterr().err
+    assert not (tmp_path / "b.mesh").exists()
+
+
 def call(tmp_path, *options, name="a.mesh"):
     (tmp_path / name).write_text(FILES[name][0]())
     out = tmp_path / f"out_{name}"

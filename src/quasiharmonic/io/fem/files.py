@@ -7,6 +7,7 @@ and their names, numbering.
 from __future__ import annotations
 
 import os
+from collections import Counter
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -60,14 +61,24 @@ class FemMesh:
         Gmsh: a physical group of any dimension, by its name or number. VTK: the points, or the nodes of the cells, at
         which an array of integers is not zero; ``NAME=VALUE`` for those where it has this value. MFEM: a named set of
         attributes of the boundary or of elements, or the number of an attribute of the boundary.
+
+        What the set belongs to may precede its name, as in ``curve:NAME``: ``point``, ``curve``, ``surface`` or
+        ``volume`` of Gmsh, ``point`` or ``cell`` of VTK, ``boundary`` or ``elements`` of MFEM. MeshFileError if several
+        sets have the name without it.
         """
         with report_damage(self.source, "the groups cannot be read: ", _DAMAGE):
-            sets = self.parts.find_sets()
-        nodes = sets.get(name)
-        if nodes is None or not nodes.size:
-            there = ", ".join(map(repr, islice(sets, 20))) + (", …" if len(sets) > 20 else "")
-            raise MeshFileError(self.source, f"there is no group {name!r}", remedy=f"available: {there or 'none'}")
-        return nodes
+            sets = {full: nodes for full, nodes in self.parts.find_sets().items() if nodes.size}
+        names = {full: full.partition(":")[2] for full in sets}
+        wanted = [name] if name in sets else [full for full in sets if names[full] == name]
+        if len(wanted) > 1:
+            remedy = f"use {' or '.join(map(repr, wanted))}"
+            raise MeshFileError(self.source, f"several groups are called {name!r}", remedy=remedy)
+        if not wanted:
+            count = Counter(names.values())
+            there = [repr(own if count[own] == 1 else full) for full, own in islice(names.items(), 20)]
+            remedy = f"available: {', '.join(there) or 'none'}" + ", …" * (len(names) > 20)
+            raise MeshFileError(self.source, f"there is no group {name!r}", remedy=remedy)
+        return sets[wanted[0]]
 
     def _finite_values(self, name: str, vertices: ArrayLike) -> FloatArray:
         """Return finite values at some points, (k, m) float64."""

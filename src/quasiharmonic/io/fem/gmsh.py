@@ -28,6 +28,7 @@ _DIMENSIONS = {
     **dict.fromkeys(_SURFACES, 2),
     **dict.fromkeys(_SOLIDS, 3),
 }
+_GROUP_KINDS = "point", "curve", "surface", "volume"
 # Sections of the entities of version 4. In a mesh that was partitioned, elements belong to those of the second.
 _ENTITIES = b"Entities", b"PartitionedEntities"
 # Elements of a kind: the kind, the physical group (version 2) or entity (version 4) of each, and the tags of the nodes.
@@ -76,7 +77,7 @@ def read_gmsh(data: bytes, solid: bool = False) -> MeshParts:
         elif name == b"NodeData":
             title = TableReader(data, begin, end, "<")
             if int(title.read_words()[0]) > 0:
-                later.setdefault(title.read_line().strip(b'"').decode("utf-8", "replace"), []).append((begin, end))
+                later.setdefault(_decode_name(title.read_line()), []).append((begin, end))
     if not (nodes and elements):
         raise ValueError(f"there is no section ${'Elements' if nodes else 'Nodes'}")
     tags, numbers = nodes[0][0], elements[0]
@@ -217,6 +218,11 @@ def _element_lines(numbers: list[int], count: int, solid: bool) -> Iterator[_Blo
         yield kind, np.array(groups, dtype=np.int64), np.array(nodes, dtype=np.int64)
 
 
+def _decode_name(quoted: bytes) -> str:
+    """Return a name without its quotes; it may itself contain quotes."""
+    return quoted.removeprefix(b'"').removesuffix(b'"').decode("utf-8", "replace")
+
+
 def _find_sets(
     data: bytes,
     spans: dict[bytes, tuple[int, int]],
@@ -225,7 +231,7 @@ def _find_sets(
     blocks: list[_Block],
     tags: tuple[IntArray, IntArray],
 ) -> dict[str, IntArray]:
-    """Return the nodes of the physical groups by name, or by number without a name.
+    """Return the nodes of the physical groups by dimension and name, or number without a name.
 
     ``tags`` are the sorted tags of the nodes, and the nodes in this order.
     """
@@ -234,7 +240,7 @@ def _find_sets(
         for line in data[slice(*spans[b"PhysicalNames"])].split(b"\n")[1:]:
             words = line.strip().split(None, 2)
             if len(words) == 3:
-                names[int(words[0]), int(words[1])] = words[2].strip(b'"').decode("utf-8", "replace")
+                names[int(words[0]), int(words[1])] = _decode_name(words[2])
     groups: dict[tuple[int, int], list[int]] | None = None
     if version != "2":
         groups = {}
@@ -243,13 +249,14 @@ def _find_sets(
                 groups |= _groups_of_entities(data, spans[section], version, order, section != _ENTITIES[0])
     found: dict[str, list[IntArray]] = {}
     for kind, numbers, nodes in blocks:
+        dimension = _DIMENSIONS[kind]
         for number in np.unique(numbers).tolist():
             own = nodes[numbers == number].ravel()
             where = tags[1][np.searchsorted(tags[0], own).clip(max=len(tags[0]) - 1)]
-            for group in ([number] * (number != 0)) if groups is None else groups.get((_DIMENSIONS[kind], number), ()):
+            for group in ([number] * (number != 0)) if groups is None else groups.get((dimension, number), ()):
                 # The sign of a group in version 4 is the orientation of its elements.
-                name = names.get((_DIMENSIONS[kind], abs(group)), str(abs(group)))
-                found.setdefault(name, []).append(where)
+                name = names.get((dimension, abs(group)), str(abs(group)))
+                found.setdefault(f"{_GROUP_KINDS[dimension]}:{name}", []).append(where)
     return {name: np.unique(np.concatenate(parts)) for name, parts in found.items()}
 
 

@@ -55,7 +55,8 @@ class MeshParts:
     fields: Fields
     # Returns the bytes of the file with the first coordinates of its points replaced, by (n, 2) or (n, 3) float64
     replace_points: Callable[[FloatArray], bytes]
-    # Returns the nodes of each named set of the file, ascending. It raises `ValueError` if the sets are damaged.
+    # Returns the nodes of each named set of the file, ascending, by what the set belongs to and its name, as in
+    # "curve:walls". It raises `ValueError` if the sets are damaged.
     find_sets: Callable[[], dict[str, IntArray]]
 
 
@@ -80,19 +81,19 @@ def find_sets_in_fields(points: Fields, cells: Fields, connectivity: IntArray, s
     has this value. Arrays of more than `_MAX_SETS` values define none.
     """
     sets: dict[str, IntArray] = {}
-    for fields, of_cells in ((points, False), (cells, True)):
+    for fields, of in ((points, "point"), (cells, "cell")):
         for name, find in fields.items():
             values = find()
             if values.shape[1] != 1 or not len(values) or (values != np.rint(values)).any():
                 continue
             values = values[:, 0]
             nodes = np.arange(len(values))
-            if of_cells:
+            if of == "cell":
                 nodes, values = connectivity[: starts[-1]], np.repeat(values, np.diff(starts))
             found = np.unique(values)
             if len(found) <= _MAX_SETS:
-                sets[name] = np.unique(nodes[values != 0])
-                sets |= {f"{name}={value:.0f}": np.unique(nodes[values == value]) for value in found}
+                sets[f"{of}:{name}"] = np.unique(nodes[values != 0])
+                sets |= {f"{of}:{name}={value:.0f}": np.unique(nodes[values == value]) for value in found}
     return sets
 
 

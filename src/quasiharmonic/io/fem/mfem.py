@@ -99,8 +99,11 @@ def _find_sets(cells: dict[bytes, bytes], named: dict[bytes, bytes]) -> dict[str
         parts = [corners for attribute, corners in of.get(name, ()) if attribute in wanted]
         return np.unique(np.concatenate([np.empty(0, dtype=np.int64), *parts]))
 
-    sets = {str(one): gather(b"boundary", {one}) for one in sorted({one for one, _ in of.get(b"boundary", ())})}
+    numbered = sorted({one for one, _ in of.get(b"boundary", ())})
+    sets = {f"boundary:{one}": gather(b"boundary", {one}) for one in numbered}
     for kind, text in named.items():
+        of_kind = _SETS[kind]
         for name, members in _SET.findall(text):
-            sets[name.decode("utf-8", "replace")] = gather(_SETS[kind], set(map(int, members.split())))
+            full = f"{of_kind.decode()}:{name.decode('utf-8', 'replace')}"
+            sets[full] = gather(of_kind, set(map(int, members.split())))
     return sets

@@ -87,7 +87,11 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
     starts = np.concatenate([[0], ends])
     F = select_elements(connectivity, starts, kinds, len(place), solid)
     fields, of_cells = (
-        {name: partial(_rows, file, array, count) for name, array in file.last_arrays(parent).items()}
+        {
+            name: partial(_rows, file, array, count)
+            for name, array in file.last_arrays(parent).items()
+            if array.attributes.get("type") in _KINDS
+        }
         for parent, count in (("PointData", file.points), ("CellData", file.cells))
     )
     return MeshParts(
@@ -102,7 +106,11 @@ def read_vtu(data: bytes, solid: bool = False) -> MeshParts:
 
 def _rows(file: _VtuFile, array: _Array, count: int) -> FloatArray:
     components = int(array.attributes.get("NumberOfComponents", "1"))
-    return file.values(array, count * components).astype(np.float64).reshape(-1, components)
+    values = file.values(array, count * components)
+    if len(values) != count * components:
+        name = array.attributes.get("Name", "")
+        raise ValueError(f"the array {name[:40]!r} has {len(values)} numbers, not {count * components}")
+    return values.astype(np.float64).reshape(count, components)
 
 
 class _VtuFile:
@@ -118,6 +126,7 @@ class _VtuFile:
         self._open: tuple[dict[str, str], int] | None = None
         self._file: dict[str, str] = {}
         self._pieces: list[dict[str, str]] = []
+        self._in_empty_piece = False
         tag = _APPENDED.search(data)
         # Appended data need not be XML, so parse only the part before.
         head = data if tag is None else data[: tag.end()] + b"</AppendedData></VTKFile>"
@@ -201,7 +210,8 @@ class _VtuFile:
         if name == "VTKFile":
             self._file = attributes
         elif name == "Piece":
-            self._pieces += [attributes] * (attributes.get("NumberOfPoints") != "0")
+            self._in_empty_piece = attributes.get("NumberOfPoints") == "0"
+            self._pieces += [attributes] * (not self._in_empty_piece)
         elif name in ("DataArray", "Array"):
             self._open = attributes, self._parser.CurrentByteIndex
         self._path.append(name)
@@ -215,7 +225,8 @@ class _VtuFile:
             # Child elements with further information may follow the numbers.
             array = _Array(attributes, tag, begin, self._data.find(b"<", begin))
             self._all.append(array)
-            self._arrays.setdefault((self._path[-1], attributes.get("Name", "")), []).append(array)
+            if not self._in_empty_piece:
+                self._arrays.setdefault((self._path[-1], attributes.get("Name", "")), []).append(array)
             self._open = None
 
     def _block(self, array: _Array, max_bytes: int) -> tuple[bytes, int, int]:

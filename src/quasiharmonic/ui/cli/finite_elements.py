@@ -260,13 +260,18 @@ def list_motions(given: list[tuple[str, Any]], axes: int) -> list[GroupMotion]:
 def move_groups(mesh: FemMesh, motions: list[GroupMotion]) -> tuple[IntArray, Callable[[float], FloatArray]]:
     """Return the nodes (k,) of all groups, and a function from the share of the motion to their positions (k, d).
 
-    Motions of the same group are applied one after another. ValueError if groups with a common node move it to
-    different positions.
+    Motions of the same group are applied one after another. MeshFileError if no element uses a node of a group;
+    ValueError if groups with a common node move it to different positions.
     """
     import numpy as np
 
+    from quasiharmonic.io.errors import MeshFileError
+
     used = np.unique(mesh.F)
     groups = {motion.name: np.intersect1d(mesh.find_set(motion.name), used) for motion in motions}
+    for name, own in groups.items():
+        if not own.size:
+            raise MeshFileError(mesh.source, f"no element uses a node of the group {name!r}", remedy="omit it")
     nodes = np.unique(np.concatenate(list(groups.values())))
 
     def place(share: float) -> FloatArray:

@@ -62,8 +62,9 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
         group=in_order(
             str,
             "NAME",
-            "move the nodes of a physical group of Gmsh or a named set; the motions after it are applied in their "
-            "order; without motions the group is fixed; repeat for several groups",
+            "move the nodes of a physical group of Gmsh or a named set, such as flap, or curve:flap if there is also "
+            "surface:flap; the motions after it are applied in their order; without motions the group is fixed; "
+            "repeat for several groups",
         ),
         positions=file(
             "file of target positions: lines 'vertex,x,y', or 'vertex,x,y,z' for tetrahedra, counting from 0",
