@@ -113,6 +113,17 @@ def test_seams_of_the_file_and_edge_costs(model, tmp_path):
     assert run("unwrap", model, "-o", second, *costs) == 2
 
 
+@pytest.mark.parametrize(
+    ("last", "said"),
+    [("1 2 0", "the factor 0 is not positive at line 3"), ("1 0 7", "edge (1, 0) has two factors, 5 and 7 at line 3")],
+)
+def test_wrong_edge_costs_are_named_by_their_line(model, tmp_path, capsys, last, said):
+    costs = tmp_path / "costs.txt"
+    costs.write_text(f"# factors\n0 1 5\n{last}\n")
+    assert run("unwrap", model, "-o", tmp_path / "out.obj", "--edge-costs", costs) == 2
+    assert f"{costs}: {said}" in capsys.readouterr().err
+
+
 def test_wrong_input_writes_nothing(model, tmp_path, capsys):
     out = tmp_path / "out.obj"
     for options in (["--max-stretch", "0.5"], ["--keep-seams"], ["--memory", "1M"]):
