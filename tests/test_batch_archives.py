@@ -190,7 +190,7 @@ class TestJournal:
             assert len(journal.entries) == step
             journal.add(self.result(str(step), None if step == 1 else b"v 0 0 0\n", form))
             journal.finish([str(k) for k in range(step + 1)], "stamp", "settings", form)
-        found = [(key, record["problem"], data) for key, record, data, _ in read_results(tmp_path / name)]
+        found = [(key, record["problem"], data) for key, record, data, *_ in read_results(tmp_path / name)]
         assert found == [("0", "0", b"v 0 0 0\n"), ("1", "1", None), ("2", "2", b"v 0 0 0\n")]
         assert os.listdir(tmp_path) == [name]
 
@@ -268,7 +268,7 @@ class TestRun:
         files = {path.relative_to(out / "results").as_posix() for path in (out / "results").rglob("*.*")}
         assert files == {"1.tar", "2.parquet", "x/0.tar"}
         for name in ("1.tar", "2.parquet", "x/0.tar"):
-            for key, record, data, found in read_results(out / "results" / name):
+            for key, record, data, found, _ in read_results(out / "results" / name):
                 assert found == form
                 assert data == (expected / "results" / key / f"map.{form}").read_bytes()
                 assert strip(record) == strip(record_of(expected, key))

@@ -15,6 +15,7 @@ import pytest
 
 from quasiharmonic import batch, io, unwrap
 from quasiharmonic.surfaces import starfish
+from quasiharmonic.ui.batch.results import read_results
 from shared.commands import linux, run
 from shared.datasets import record_of
 from shared.gltf_files import square, touching_squares
@@ -36,6 +37,33 @@ def models(tmp_path):
     (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
     (folder / "text.obj").write_text("f one two three\n")
     return folder
+
+
+def write_archive(path, models):
+    """Write models, by their names, to an archive."""
+    if path.suffix == ".parquet":
+        rows = [{"name": name.removesuffix(".glb"), "glb": data} for name, data in models.items()]
+        pytest.importorskip("pyarrow.parquet").write_table(pytest.importorskip("pyarrow").Table.from_pylist(rows), path)
+        return
+    with tarfile.open(path, "w") as tar:
+        for name, data in models.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            tar.addfile(info, streams.BytesIO(data))
+
+
+def read_archive(path):
+    """The maps in an archive of results, and the files beside them, by their names."""
+    found = {}
+    for result in read_results(path):
+        folder = result.key.rpartition("/")
+        found[f"{result.key}.{result.form}"] = result.data
+        found |= {folder[0] + folder[1] + name: data for name, data in result.files.items()}
+    if path.suffix == ".tar":
+        with tarfile.open(path) as tar:
+            named = [name for name in tar.getnames() if not name.endswith(".json")]
+            assert found == {name: tar.extractfile(name).read() for name in named}
+    return found
 
 
 def settings(**options):
@@ -96,12 +124,8 @@ def test_a_stopped_run_is_continued(models, tmp_path, capsys, how, status):
 
 
 def test_archives_and_shards(models, tmp_path):
-    with tarfile.open(tmp_path / "models.tar", "w") as tar:
-        for name in ("one", "two", "three"):
-            data = (models / "clean.obj").read_bytes()
-            info = tarfile.TarInfo(f"{name}.obj")
-            info.size = len(data)
-            tar.addfile(info, streams.BytesIO(data))
+    data = (models / "clean.obj").read_bytes()
+    write_archive(tmp_path / "models.tar", {f"{name}.obj": data for name in ("one", "two", "three")})
     assert batch.run(tmp_path / "models.tar", tmp_path / "out", settings(), jobs=1).solved == 3
     with tarfile.open(tmp_path / "out/results/models.tar") as tar:
         assert {"one.obj", "one.json", "three.obj"} <= set(tar.getnames())
@@ -109,6 +133,38 @@ def test_archives_and_shards(models, tmp_path):
         batch.run(models, tmp_path / "shards", settings(), jobs=1, shard=shard)
     merged = batch.merge([tmp_path / "shards"], tmp_path / "shards")
     assert (merged.total, merged.solved) == (4, 2)
+
+
+@pytest.mark.parametrize("suffix", [".tar", ".parquet"])
+def test_results_in_archives_have_the_materials_of_each_model(tmp_path, suffix):
+    picture = b"\x89PNG\r\n\x1a\n of a wall"
+    made = square()
+    made.tree["images"] = [{"bufferView": made.view(picture), "mimeType": "image/png"}]
+    made.tree["textures"] = [{"source": 0}]
+    looks = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    made.tree["materials"] = [{"name": "map-texture", **looks}]
+    made.tree["meshes"][0]["primitives"][0]["material"] = 0
+    models = {"a b.glb": made.glb(), "a_b.glb": made.glb(), "in/plain.glb": square().glb(), "in/last.glb": made.glb()}
+    # The results of the first models are copied when the archive has more of them.
+    for count in (2, 4):
+        some = dict(list(models.items())[:count])
+        write_archive(tmp_path / f"set{suffix}", some)
+        progress = batch.run(tmp_path / f"set{suffix}", tmp_path / "out", settings(), jobs=1)
+        assert (progress.solved, progress.resumed) == (count, count - 2)
+    found = read_archive(tmp_path / f"out/results/set{suffix}")
+    names = {"a b": "a%20b", "a_b": "a_b", "in/last": "in/last"}
+    assert set(found) == {f"{key}.obj" for key in [*names, "in/plain"]} | {
+        f"{name}.texture{end}" for name in names.values() for end in (".mtl", "-0.png")
+    }
+    for key, name in names.items():
+        stem = f"{name.rpartition('/')[2]}.texture".encode()
+        assert found[f"{key}.obj"].startswith(b"mtllib " + stem + b".mtl\n")
+        assert b"usemtl map-texture\n" in found[f"{key}.obj"]
+        library = found[f"{name}.texture.mtl"]
+        assert library.startswith(b"newmtl map-texture\n")
+        assert library.endswith(b"map_Kd " + stem + b"-0.png\n")
+        assert found[f"{name}.texture-0.png"] == picture
+    assert b"mtllib" not in found["in/plain.obj"]
 
 
 def test_meshes_and_instances_of_gltf_files_are_distinguished(tmp_path):

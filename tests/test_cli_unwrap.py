@@ -14,6 +14,7 @@ from quasiharmonic.atlas import pack_charts
 from quasiharmonic.geometry.mesh.topology import components
 from quasiharmonic.surfaces import starfish
 from quasiharmonic.ui.cli import parser_of
+from shared.cleaning import cube
 from shared.commands import run
 
 V, F = starfish(2, 4)
@@ -110,6 +111,17 @@ def test_seams_of_the_file_and_edge_costs(model, tmp_path):
     assert {tuple(edge) for edge in io.mapped(io.read_mesh(second)).seams.tolist()} != seams[0]
     (tmp_path / "costs.txt").write_text("0 99999 2\n")
     assert run("unwrap", model, "-o", second, *costs) == 2
+
+
+@pytest.mark.parametrize(
+    ("last", "said"),
+    [("1 2 0", "the factor 0 is not positive at line 3"), ("1 0 7", "edge (1, 0) has two factors, 5 and 7 at line 3")],
+)
+def test_wrong_edge_costs_are_named_by_their_line(model, tmp_path, capsys, last, said):
+    costs = tmp_path / "costs.txt"
+    costs.write_text(f"# factors\n0 1 5\n{last}\n")
+    assert run("unwrap", model, "-o", tmp_path / "out.obj", "--edge-costs", costs) == 2
+    assert f"{costs}: {said}" in capsys.readouterr().err
 
 
 def test_wrong_input_writes_nothing(model, tmp_path, capsys):
@@ -255,6 +267,27 @@ def test_written_models_with_defects_pass_the_check_chart_by_chart(tmp_path, cap
     assert report["degenerate_triangles"] == [len(F) + 1]
     assert "triangle 3: verified with the winding of the neighbours" in said
     assert run("plot", out, "-o", tmp_path / "out.png") == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("reversed", "triangle 0: verified with the winding of the neighbours"),
+        ("repeated", "triangle 12: left out, because an earlier triangle has the same vertices"),
+    ],
+)
+def test_the_check_of_a_box_with_a_defect_measures_the_gaps_between_its_charts(tmp_path, capsys, kind, said):
+    V, F = cube()
+    first, rest = (F[:1, ::-1], F[1:]) if kind == "reversed" else (F[:1], np.concatenate([F[1:], F[:1]]))
+    io.write_obj(tmp_path / "box.obj", io.MeshData(V, np.concatenate([first, rest])))
+    options = ["--resolution", 512, "--symmetry", "none"]
+    assert run("unwrap", tmp_path / "box.obj", "-o", tmp_path / "out.obj", *options) == 0
+    charts = capsys.readouterr().out.split(" charts,")[0].split()[-1]
+    assert run("check", tmp_path / "out.obj") == 0
+    out = capsys.readouterr().out
+    assert f"{charts} islands: {charts} injective, {charts} bijective." in out
+    assert said in out
+    assert "Islands are more than 8 texels apart" in out
 
 
 @pytest.mark.slow

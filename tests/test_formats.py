@@ -14,7 +14,7 @@ import quasiharmonic
 from quasiharmonic import io
 from quasiharmonic.atlas import SeamedMesh
 from quasiharmonic.io.fem.files import check_fem_output, read_fem
-from quasiharmonic.surfaces import disk
+from quasiharmonic.surfaces import disk, grid
 from quasiharmonic.ui.cli import COMMANDS, main
 from shared.formats import SINGLE, try_format, with_map
 
@@ -66,6 +66,13 @@ def test_suffix_chooses_the_format(suffix, tmp_path):
 def test_losses_are_listed_for_every_format(suffix):
     lost = io.not_held(f"out{suffix}", io.MeshData(*disk(2)))
     assert any("single precision" in what for what in lost) == (suffix in SINGLE)
+
+
+def test_digits_that_a_glb_file_loses_are_listed_only_if_there_are_any():
+    V, F = grid(4, 4)
+    lost = ["digits beyond single precision"]
+    for points, uv, named in ((V, V, []), (V / 3, V, lost), (V, V / 3, lost), (V, V * 2**-30, lost)):
+        assert io.not_held("out.glb", io.MeshData(points, F).with_map(uv)) == named
 
 
 @pytest.mark.parametrize("suffix", MAPS)

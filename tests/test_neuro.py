@@ -173,7 +173,7 @@ def test_the_hemisphere_of_the_input_is_kept(where, tmp_path):
         io.write_map(tmp_path / name, mesh, V)
         written = gifti.GiftiImage.from_filename(tmp_path / name)
         assert written.darrays[0].meta.get("AnatomicalStructurePrimary") == expected
-    assert "digits beyond single precision" in io.not_held("a.glb", io.read_mesh(tmp_path / "100307.L.flat.gii"))
+    assert io.not_held("a.glb", io.read_mesh(tmp_path / "100307.L.flat.gii")) == []
 
 
 def test_objects_of_nibabel_are_meshes(tmp_path):

@@ -6,10 +6,11 @@ import tracemalloc
 
 import numpy as np
 
-from quasiharmonic import unwrap
+from quasiharmonic import io, unwrap
 from quasiharmonic.apps.unwrapping.chart_verdict import certify_defective
 from quasiharmonic.atlas import SeamedMesh, certify, polish
 from quasiharmonic.surfaces import disk, grid
+from quasiharmonic.ui.cli.written_map import certify_map
 
 
 def folded(n):
@@ -85,3 +86,9 @@ def test_defective_maps_take_memory_in_proportion_to_their_size():
     tracemalloc.stop()
     # All pairs of vertices would take 200 MB.
     assert peak < 50e6
+
+
+def test_overlapping_positive_triangles_of_mixed_winding_are_not_set_apart():
+    V = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1]])
+    found = certify_map(io.MeshData(V, np.array([[0, 1, 2], [0, 1, 3]])).with_map(V[:, :2]))
+    assert (found.injective, found.bijective, found.set_apart) == (True, False, None)

@@ -280,7 +280,9 @@ class _Baker:
         outside = ((low < -margin) | (high > 1 + margin)).any(axis=1) & ~bare
         if outside.any():
             count = count_of("triangle reaches", "triangles reach", int(outside.sum()))
-            self.problems.append(f"{count} beyond the unit square of the new texture coordinates, and not baked there")
+            self.problems.append(
+                f"{count} beyond the unit square of the new texture coordinates, where nothing is baked"
+            )
         a, b, c = self._corners.swapaxes(0, 1)
         longest = np.max([((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
         degenerate = np.linalg.norm(np.cross(b - a, c - a), axis=1) <= _TUNING.thin * longest

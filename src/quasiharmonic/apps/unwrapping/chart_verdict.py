@@ -271,12 +271,15 @@ def certify_defective(
     preferred = np.zeros(len(F), dtype=np.int64)
     preferred[cleaned.triangles] = np.where(cleaned.flipped, -1, 1)
     mesh, turned = _orient_mesh(V[F[rows]], corner_uv[rows], corner_key[rows], preferred[rows])
+    changed, inside_out = bool(excluded_copies.any() or turned.any()), bool((cleaned.facing < 0).all())
+    if not (changed or inside_out):
+        return None
     verdict = certify(mesh)
     # A texture is mirrored if `unwrap` treated an inside-out model as turned outward.
-    inward = len(verdict.islands) == 1 and not verdict.injective and bool((cleaned.facing < 0).all())
+    inward = inside_out and len(verdict.islands) == 1 and not verdict.injective
     if inward:
         verdict = certify(SeamedMesh(mesh.V, mesh.F[:, ::-1], mesh.F[:, ::-1], mesh.uv))
-    elif not (excluded_copies.any() or turned.any()):
+    elif not changed:
         return None
     excluded = mark(len(F), cleaned.excluded)
     unsure = [k for k, one in enumerate(verdict.islands) if excluded[rows[one.triangles]].all()]

@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator
 from hashlib import blake2b
 from itertools import islice
@@ -112,6 +113,8 @@ COLUMNS: dict[str, type] = {
 TABLES = "records.csv", "records.parquet"
 #: File name of the record in the folder of a problem's results.
 FILE = "record.json"
+# Start of the names of the material library and the images beside a map.
+_LIBRARY = "map-texture"
 _ROWS = 1000
 _NO_TABLE = "cannot be read as a table: "
 
@@ -176,7 +179,7 @@ def clear(folder: Path) -> None:
 def remove_results(folder: Path) -> None:
     """Delete the results in a folder, the record first; OSError if that fails."""
     maps = [map_path(folder, form) for form in MAP_FORMATS]
-    for path in (folder / FILE, *maps, *folder.glob(".qhm-*.tmp")):
+    for path in (folder / FILE, *maps, *folder.glob(".qhm-*.tmp"), *folder.glob(_LIBRARY + "*")):
         remove_file(path)
 
 
@@ -186,11 +189,25 @@ def describe_contents(data: bytes) -> Record:
 
 
 def read_map(path: Path) -> bytes | None:
-    """Return the contents of a map; None if it cannot be read."""
+    """Return the contents of a map, or of a file beside it; None if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError:
         return None
+
+
+def read_library(folder: Path, data: bytes, stem: str) -> tuple[bytes, dict[str, bytes]]:
+    """Return a map, and the material library and the images beside it by name; the names begin with ``stem``."""
+    beside = {path.name: read_map(path) for path in sorted(folder.glob(_LIBRARY + "*"))}
+    found = {stem + name.removeprefix(_LIBRARY): file for name, file in beside.items() if file is not None}
+    if not found:
+        return data, {}
+    named = re.compile(rb"^(mtllib|map_K[de]|norm) " + _LIBRARY.encode(), re.MULTILINE)
+
+    def rename(text: bytes, count: int = 0) -> bytes:
+        return named.sub(lambda match: match[1] + b" " + os.fsencode(stem), text, count)
+
+    return rename(data, 1), {name: rename(file) if name.endswith(".mtl") else file for name, file in found.items()}
 
 
 def is_intact(record: Record, data: bytes | None) -> bool:

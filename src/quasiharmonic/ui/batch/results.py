@@ -1,14 +1,16 @@
 """Archives of results: one for each archive of problems, with the same names in the same order.
 
-A tar file has ``NAME.obj`` or ``NAME.ply``, the map, and ``NAME.json``, the record, for each problem. A Parquet file
-has the columns of the records and ``obj`` or ``ply``. The metadata of both identify the input and the settings.
+A tar file has ``NAME.obj`` or ``NAME.ply``, the map, and ``NAME.json``, the record, for each problem. Between them are
+the material library of the map, ``NAME.texture.mtl``, and its images. A Parquet file has the columns of the records,
+``obj`` or ``ply``, and ``files``, the library and the images. The metadata of both identify the input and the settings.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator
+import posixpath
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, NamedTuple
@@ -35,6 +37,8 @@ from quasiharmonic.util.options import MAP_FORMATS
 PART = ".part"
 # Extension of a record.
 _RECORD = ".json"
+# Column of the material library and the images of a map.
+_FILES = "files"
 # Bytes at the start of a tar file with its metadata.
 _MAX_ABOUT = 1 << 16
 _MARK = b"quasiharmonic"
@@ -48,6 +52,7 @@ class Result(NamedTuple):
     record: Record
     data: bytes | None  # The map, if there is one and it was asked for
     form: str  # Format of the map, one of `MAP_FORMATS`
+    files: Mapping[str, bytes] = {}  # Material library and images of the map, by their names in its folder
 
 
 def read_about(location: str) -> dict[str, Any] | None:
@@ -88,9 +93,10 @@ def _write_tar(file: BinaryIO, about: str, found: Iterable[Result]) -> None:
     file.write(END_MARK)
 
 
-def pack_result(key: str, record: Record, data: bytes | None, form: str) -> bytes:
-    """Return the members of a result in a tar file: the map, if there is one, and the record after it."""
+def pack_result(key: str, record: Record, data: bytes | None, form: str, files: Mapping[str, bytes]) -> bytes:
+    """Return the members of a result in a tar file: the map, if there is one, its files, and the record after them."""
     packed = b"" if data is None else pack_member(f"{key}.{form}", data)
+    packed += b"".join(pack_member(posixpath.join(posixpath.dirname(key), name), files[name]) for name in files)
     return packed + pack_member(key + _RECORD, json.dumps(record, allow_nan=False).encode() + b"\n")
 
 
@@ -100,7 +106,11 @@ def _write_parquet(file: BinaryIO, about: str, found: Iterable[Result], form: st
 
     schema = records.table_schema()
     schema = schema.insert(0, pyarrow.field(KEYS[0], pyarrow.string())).append(pyarrow.field(form, pyarrow.binary()))
-    rows = ({KEYS[0]: key, **records.table_row(record), form: data} for key, record, data, _ in found)
+    schema = schema.append(pyarrow.field(_FILES, pyarrow.map_(pyarrow.string(), pyarrow.binary())))
+    rows = (
+        {KEYS[0]: key, **records.table_row(record), form: data, _FILES: list(files.items()) or None}
+        for key, record, data, _, files in found
+    )
     records.write_parquet(file, schema.with_metadata({_MARK: about}), rows, _ROWS)
 
 
@@ -165,29 +175,33 @@ class TarResult(NamedTuple):
 
 
 def read_tar_results(file: BinaryIO, *, maps: bool = True) -> Iterator[TarResult]:
-    """Read the results of a tar file, which have the record after the map."""
+    """Read the results of a tar file, which have the record after the map and its files."""
     mapped: Member | None = None
+    files: dict[str, bytes] = {}
     for member in read_members(file, lambda name: maps or name.endswith(_RECORD)):
         if isinstance(member, Damage):
             yield TarResult(None, member.start, member.start)
             continue
         key, extension = os.path.splitext(member.name)
         if extension[1:] in MAP_FORMATS:
-            mapped = member
+            mapped, files = member, {}
         elif extension == _RECORD:
             name, form = ("", "") if mapped is None else os.path.splitext(mapped.name)
             own = mapped if name == key else None
             record = records.parse_record(member.data or b"")
             data, start = (None, member.start) if own is None else (own.data, own.start)
-            yield TarResult(None if record is None else Result(key, record, data, form[1:]), start, member.end)
-            mapped = None
+            result = None if record is None else Result(key, record, data, form[1:], files if own else {})
+            yield TarResult(result, start, member.end)
+            mapped, files = None, {}
+        elif member.data is not None:
+            files[posixpath.basename(member.name)] = member.data
 
 
 def _parquet_results(path: Path, maps: bool) -> Iterator[Result]:
     with load_pyarrow().ParquetFile(path) as file:
         form = _form_of(file)
-        columns = [name for name in file.schema_arrow.names if maps or name != form]
+        columns = [name for name in file.schema_arrow.names if maps or name not in (form, _FILES)]
         for rows in file.iter_batches(_ROWS, columns=columns):
             for row in rows.to_pylist():
-                key, data = row.pop(KEYS[0]), row.pop(form, None)
-                yield Result(key, {name: value for name, value in row.items() if value is not None}, data, form)
+                key, data, files = row.pop(KEYS[0]), row.pop(form, None), dict(row.pop(_FILES, None) or ())
+                yield Result(key, {name: value for name, value in row.items() if value is not None}, data, form, files)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import io
 import os
+import posixpath
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -171,9 +173,15 @@ class ArchiveWriter(ResultWriter):
         assert self._journal is not None, "open was not called"
         if record.get("error"):
             record["error"] = record["error"].replace(str(files.results), record["source"])
-        path = self._orders.map_path(self._orders.folder(files))
-        data = None if record.get("map_bytes") is None else records.read_map(path)
-        self._journal.add(Result(self._key_of(files), record, data, self._form))
+        folder, key = self._orders.folder(files), self._key_of(files)
+        data = None if record.get("map_bytes") is None else records.read_map(self._orders.map_path(folder))
+        beside: dict[str, bytes] = {}
+        if data is not None:
+            # In OBJ files a blank ends a name. Different problems get different names.
+            stem = re.sub(r"[\s%]", lambda match: f"%{ord(match[0]):02X}", posixpath.basename(key))
+            data, beside = records.read_library(folder, data, f"{stem}.texture")
+            record |= records.describe_contents(data)
+        self._journal.add(Result(key, record, data, self._form, beside))
 
     def fail(self, error: OSError) -> None:
         # Without an archive of results the next run tries again.

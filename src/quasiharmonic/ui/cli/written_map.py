@@ -128,12 +128,16 @@ def certify_map(mesh: MeshData, *, precision: str = "float64", weld: bool | floa
     verdict = None if alone else certify_islands(SeamedMesh(V, F, FT, uv))
     bent = np.setdiff1d(find_bent(mesh, F, uv), unmapped)
     found = WrittenMap(V, F, uv, certify(opened.F, uv, numbers=rows), verdict, mesh.faces, unmapped, bent)
-    if found.certificate.injective or mesh.vt is None:
+    positive = found.certificate.injective
+    if (positive and found.apart) or mesh.vt is None:
         return found
     from quasiharmonic.apps.unwrapping.chart_verdict import certify_defective
 
     charts = certify_defective(mesh.V, joined.F[rows], uv[opened.F], rows)
-    return found if charts is None else replace(found, verdict=charts[0], set_apart=charts[1])
+    # Repeated triangles overlap although all are positive. Then none needs the opposite winding.
+    if charts is None or (positive and charts[1].reversed.size):
+        return found
+    return replace(found, verdict=charts[0], set_apart=charts[1])
 
 
 def find_bent(mesh: MeshData, F: NDArray[np.int64], uv: NDArray[np.float64]) -> NDArray[np.int64]:

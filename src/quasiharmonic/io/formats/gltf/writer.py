@@ -62,7 +62,7 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
             lost.append("tangents, because the texture coordinates changed")
         lost += [f"the image {name}, which is not an image file in the folder of {mesh.source}" for name in missing]
         return lost
-    if not isinstance(carried, CarriedGltf):
+    if not isinstance(carried, CarriedGltf) and not _is_single(mesh):
         lost.append("digits beyond single precision")
     if carried is not None:
         lost += carried.further()
@@ -81,6 +81,16 @@ def not_in_gltf(mesh: MeshData) -> list[str]:
         "the appearance of materials": b"mtllib" in words and mesh.texture is None,
     }
     return lost + [what for what, holds in faults.items() if holds]
+
+
+def _is_single(mesh: MeshData) -> bool:
+    """Whether the file stores positions, normals and texture coordinates exactly."""
+    with np.errstate(over="ignore"):
+        pairs = [(table, table.astype(np.float32)) for table in (mesh.V, normals_of(mesh)) if table is not None]
+        for uv in (*mesh.lower_maps, mesh.corner_uv):
+            places = (uv * [1, -1] + [0, 1]).astype(np.float32)
+            pairs.append((uv, places * np.array([1, -1]) + [0, 1]))
+    return all(np.array_equal(table, stored, equal_nan=True) for table, stored in pairs)
 
 
 def _replace_map(carried: CarriedGltf, mesh: MeshData) -> Document:

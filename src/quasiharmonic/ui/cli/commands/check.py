@@ -158,7 +158,13 @@ def _describe_gaps(certified: WrittenMap) -> list[str]:
     uv = certified.uv
     if certified.verdict is None or not certified.apart or np.nanmin(uv) < 0 or np.nanmax(uv) > 1:
         return []
-    gap = measure_clearance(certified.certificate.loops, uv * _RESOLUTION, components(certified.F, len(uv)), reach=_FAR)
+    # Triangles that the verdict reverses are apart in the cut mesh. Those that it leaves out are in no island.
+    part, island = components(certified.F, len(uv)), np.full(len(uv), -1)
+    for k, one in enumerate(certified.verdict.islands):
+        island[part[certified.F[one.triangles]]] = k
+    island = island[part]
+    loops = tuple(loop for loop in certified.certificate.loops if island[loop[0]] >= 0)
+    gap = measure_clearance(loops, uv * _RESOLUTION, island, reach=_FAR)
     apart = f"at least {gap:.3g}" if gap < float("inf") else f"more than {_FAR}"
     return [f"Islands are {apart} texels apart at {_RESOLUTION} × {_RESOLUTION}."]
 

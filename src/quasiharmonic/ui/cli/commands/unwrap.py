@@ -253,6 +253,7 @@ def _edge_costs(mesh: MeshData, path: Path | None) -> Any:
 
     from quasiharmonic.apps.unwrapping.model_files import polygon_costs
     from quasiharmonic.geometry.mesh.topology import edge_keys
+    from quasiharmonic.io.errors import MeshFileError
     from quasiharmonic.io.untrusted import read_rows
     from quasiharmonic.util.arrays import edge_names
 
@@ -260,7 +261,13 @@ def _edge_costs(mesh: MeshData, path: Path | None) -> Any:
         return polygon_costs(mesh)
     n = len(mesh.V)
     keys, costs = edge_keys(mesh.F, mesh.F[:, (1, 2, 0)], n), np.ones(mesh.F.shape)
-    table = np.array([row for _, row in read_rows(path, 3)]).reshape(-1, 3)
+    rows, known = read_rows(path, 3), dict[tuple[float, ...], float]()
+    for line, (i, j, factor) in rows:
+        if factor <= 0:
+            raise MeshFileError(path, f"the factor {factor:g} is not positive", line)
+        if (other := known.setdefault((min(i, j), max(i, j)), factor)) != factor:
+            raise MeshFileError(path, f"edge ({i:g}, {j:g}) has two factors, {other:g} and {factor:g}", line)
+    table = np.array([row for _, row in rows]).reshape(-1, 3)
     pairs = table[:, :2].astype(np.int64)
     wanted = edge_keys(pairs[:, 0], pairs[:, 1], n)
     absent = (pairs != table[:, :2]).any(axis=1) | ~np.isin(wanted, keys)
