@@ -354,7 +354,8 @@ def _bent(mesh: SeamedMesh, polygons: Any, verdict: AtlasVerdict) -> IntArray:
     mirrored = polygons.of_triangle[_mirrored(verdict)]
     front, back = (find_concave(polygons, mesh.FT, mesh.uv * [side, 1.0]) for side in (1.0, -1.0))
     bent = np.union1d(np.setdiff1d(front, mirrored), np.intersect1d(back, mirrored))
-    return np.setdiff1d(bent, polygons.of_triangle[verdict.inverted])
+    shown = polygons.of_triangle[mesh.mapped]
+    return np.intersect1d(np.setdiff1d(bent, polygons.of_triangle[verdict.inverted]), shown)
 
 
 def _mirrored(verdict: AtlasVerdict) -> IntArray:
