@@ -118,8 +118,11 @@ class QHM_OT_unwrap(Working):
         if any(part.pinned.any() for part in self._parts):
             self.report({"INFO"}, f"{self.bl_label}: islands with pinned UVs stay as they are")
         if self.symmetry != "none":
-            for line in describe_symmetry(result.symmetry):
-                self.report({"INFO"}, f"{self.bl_label}: {line}")
+            found = result.symmetry
+            reason = found.reason or "seams are kept" * self.keep_seams
+            said = f"the symmetry in {self.symmetry} was not applied{reason and ': '}{reason}"
+            for line in describe_symmetry(found) or [said]:
+                self.report({"INFO" if found.applied else "WARNING"}, f"{self.bl_label}: {line}")
         changed = [thing.name for thing in self._objects if thing.modifiers]
         if changed:
             names = ", ".join(changed[:3]) + (", …" if len(changed) > 3 else "")
