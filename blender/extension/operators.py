@@ -25,7 +25,7 @@ from quasiharmonic.util.options import ENERGY_LABELS, PolishOptions
 
 from . import outline, pins, surface
 from .advice import translate_advice
-from .job import Work, Working, find_objects
+from .job import Work, Working
 from .surface import Refused
 
 _ENERGIES = [(name, label.capitalize(), f"The energy {name}") for name, label in ENERGY_LABELS.items()]
@@ -66,10 +66,8 @@ class UvWorking(Working):
     def find_objects(self, context: bpy.types.Context) -> list[bpy.types.Object]:
         """Return the mesh objects to work on, the active one first; of objects that share a mesh the first."""
         found: list[bpy.types.Object] = []
-        for thing in find_objects(context, self.mode, self.edited):
-            if thing == context.active_object:
-                surface.require_local(thing)
-            if thing == context.active_object or (len(thing.data.polygons) and thing.data.library is None):
+        for thing in super().find_objects(context):
+            if thing == context.active_object or len(thing.data.polygons):
                 found += [] if any(other.data == thing.data for other in found) else [thing]
         return found
 

@@ -72,14 +72,13 @@ def read_parts(objects: Sequence[bpy.types.Object], *, edited: bool) -> list[Par
     Raises
     ------
     Refused
-        If there are no such faces, a mesh is linked from another file, or the scale of an object is not finite.
+        If there are no such faces, or the scale of an object is not finite.
     """
     parts: list[Part] = []
     for thing in objects:
         data = thing.data
         if any(part.data == data for part in parts) or not len(data.polygons):
             continue
-        surface.require_local(thing)
         if edited and numbers(data.polygons, "hide", 1, np.bool_).all():
             continue
         here = surface.read(data, edited=edited, chosen_only=False)
