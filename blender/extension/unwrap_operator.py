@@ -107,7 +107,8 @@ class QHM_OT_unwrap(Working):
         """Write the texture coordinates and report them."""
         crossed = unwrapping.write_parts(self._parts, result, around=self._around, mark_seams=self.mark_seams)
         sound = result.success and not result.misses and not crossed
-        self.report({"INFO" if sound else "WARNING"}, f"{self.bl_label}: {describe_unwrap(result, crossed)}")
+        said = describe_unwrap(result, crossed) + unwrapping.describe_others(self._parts)
+        self.report({"INFO" if sound else "WARNING"}, f"{self.bl_label}: {said}")
         changes = ", ".join(f"{name}: {len(found)}" for name, found in result.cleaned.changes.items() if len(found))
         if changes:
             self.report({"INFO"}, f"{self.bl_label}: the mesh is unchanged, but was treated as if cleaned. {changes}")

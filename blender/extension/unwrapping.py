@@ -200,6 +200,13 @@ def write_parts(parts: Sequence[Part], result: UnwrapResult, *, around: bool, ma
     return crossed
 
 
+def describe_others(parts: Sequence[Part]) -> str:
+    """Return a sentence on the islands of the parts that were not unwrapped, once the others are written."""
+    layers = [numbers(part.data.uv_layers.active.uv, "vector", 2, np.float32).astype(np.float64) for part in parts]
+    surfaces = [part.surface for part in parts]
+    return surface.describe_others(list(zip(surfaces, layers, (part.chosen for part in parts), strict=True)))
+
+
 def _stretch_of(matrix: FloatArray) -> FloatArray:
     """Return the scale and shear (3, 3) of an object's matrix, without rotation and reflection."""
     _, scale, axes = np.linalg.svd(matrix)
