@@ -53,7 +53,8 @@ def test_symmetric_seams(said):
     scenes.add_quads()
     for options, reason in [({}, "not every vertex has a mirror image"), ({"keep_seams": True}, "seams are kept")]:
         assert bpy.ops.uv.qhm_unwrap(symmetry="z", **options) == {"FINISHED"}
-        assert f"Warning: Unwrap Model: the symmetry in z was not applied: {reason}" in said()
+        (line,) = (line for line in said().splitlines() if reason in line)
+        assert line.startswith("Warning: Unwrap Model: ")
 
 
 def test_new_islands_are_placed_around_the_faces_that_are_not_selected():
