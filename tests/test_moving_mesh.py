@@ -18,7 +18,7 @@ from quasiharmonic.energies.newton.newton_descent import NewtonDescent
 from quasiharmonic.energies.polishing import scale_energy
 from quasiharmonic.io import MeshData, write_obj
 from quasiharmonic.problem import Domain
-from quasiharmonic.surfaces import annulus, disk
+from quasiharmonic.surfaces import annulus, disk, grid
 
 
 @pytest.fixture
@@ -149,6 +149,20 @@ def test_curved_walls_do_not_change():
     assert np.abs(there[wall] - points[wall]).max() > 1e-3
     assert radius.min() > lowest - 1e-12
     assert certify(mesh.F, there).bijective
+
+
+@pytest.mark.parametrize("steps", [1, 10])
+def test_vertices_of_straight_walls_make_way_for_moved_vertices(steps):
+    """A piston moves along two walls, and some vertices of the bottom move along it."""
+    points, F = grid(8, 8)
+    piston, some = points[:, 1] == 1, (points[:, 1] == 0) & (np.abs(points[:, 0] - 0.5) < 0.2)
+    for moved, way in ((np.flatnonzero(piston), (0, -0.6)), (np.flatnonzero(some), (0.25, 0))):
+        mesh = MovingMesh(points, F, moved, slide=True)
+        for share in np.linspace(0, 1, steps + 1)[1:]:
+            there = mesh.advance(points[moved] + share * np.array(way))
+        np.testing.assert_array_equal(there[moved], points[moved] + way)
+        assert certify(mesh.F, there).bijective
+        assert mean_ratio(there, F).min() > 0.3
 
 
 def test_an_unreachable_boundary_leaves_the_mesh_unchanged(ring):

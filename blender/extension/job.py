@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 
 from .advice import translate_advice
-from .surface import Refused
+from .surface import Refused, require_local
 
 # Seconds between two checks of a thread.
 _LOOK = 0.05
@@ -104,6 +104,22 @@ class Working(bpy.types.Operator):
         """Write the result of the work."""
         raise NotImplementedError
 
+    def find_objects(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        """Return the mesh objects to work on, the active one first: in edit mode those edited.
+
+        Objects whose mesh is linked from another file are left out and reported. If it is the active one, raise
+        `Refused`.
+        """
+        active, things = context.active_object, self.edited
+        require_local(active)
+        if self.mode != "EDIT":
+            things = context.selected_objects if active.select_get() else []
+        others = [thing for thing in things if thing.type == "MESH" and thing != active]
+        if linked := [thing.name for thing in others if thing.data.library is not None]:
+            said = f"linked from another file, so left unchanged: {list_names(linked)}"
+            self.report({"INFO"}, f"{self.bl_label}: {said}")
+        return [active, *(thing for thing in others if thing.data.library is None)]
+
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Run the work immediately, as scripts expect."""
         return self._guarded(context, self._at_once)
@@ -178,12 +194,9 @@ class Working(bpy.types.Operator):
             return {"CANCELLED"}
 
 
-def find_objects(context: bpy.types.Context, mode: str, edited: list[bpy.types.Object]) -> list[bpy.types.Object]:
-    """Return the mesh objects that an operator works on, the active one first: in edit mode those edited."""
-    active, things = context.active_object, edited
-    if mode != "EDIT":
-        things = context.selected_objects if active.select_get() else []
-    return [active, *(thing for thing in things if thing.type == "MESH" and thing != active)]
+def list_names(names: list[str]) -> str:
+    """Return the first three names."""
+    return ", ".join(names[:3]) + (", …" if len(names) > 3 else "")
 
 
 @contextmanager

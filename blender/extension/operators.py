@@ -25,7 +25,7 @@ from quasiharmonic.util.options import ENERGY_LABELS, PolishOptions
 
 from . import outline, pins, surface
 from .advice import translate_advice
-from .job import Work, Working, find_objects
+from .job import Work, Working
 from .surface import Refused
 
 _ENERGIES = [(name, label.capitalize(), f"The energy {name}") for name, label in ENERGY_LABELS.items()]
@@ -66,10 +66,8 @@ class UvWorking(Working):
     def find_objects(self, context: bpy.types.Context) -> list[bpy.types.Object]:
         """Return the mesh objects to work on, the active one first; of objects that share a mesh the first."""
         found: list[bpy.types.Object] = []
-        for thing in find_objects(context, self.mode, self.edited):
-            if thing == context.active_object:
-                surface.require_local(thing)
-            if thing == context.active_object or (len(thing.data.polygons) and thing.data.library is None):
+        for thing in super().find_objects(context):
+            if thing == context.active_object or len(thing.data.polygons):
                 found += [] if any(other.data == thing.data for other in found) else [thing]
         return found
 
@@ -93,10 +91,13 @@ class UvWorking(Working):
         lost = np.setdiff1d(verdict.inverted, surface.certify(mapped).inverted)
         if lost.size:
             remark = (
-                f"{count_of('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision. "
+                f" {count_of('triangle is', 'triangles are', lost.size)} too narrow for Blender's single precision."
             )
+        changed = np.zeros(len(stored.F), dtype=np.bool_)
+        changed[stored.mapped] = True
+        others = surface.describe_others([(self.surface, stored.uv, changed)])
         kind = "INFO" if verdict.injective else "WARNING"
-        self.report({kind}, f"{self.label}{remark}{_describe(verdict)}{_describe_others(self.surface, stored)}")
+        self.report({kind}, f"{self.label}{_describe(verdict)}{others}{remark}")
 
 
 class ChosenWorking(UvWorking):
@@ -164,7 +165,7 @@ class QHM_OT_repair(ChosenWorking):
                 mesh.V, mesh.F, mesh.uv, FT=mesh.FT, fixed=fixed, unmirror=unmirror, callback=reports_progress
             )
             reasons = " ".join(island.reason for island in result.islands if island.reason)
-            return result.mesh, f"{translate_advice(reasons)} " if reasons else ""
+            return result.mesh, f" {translate_advice(' '.join(reasons.split()))}" if reasons else ""
 
         return work
 
@@ -314,27 +315,12 @@ def _require_borders(mesh: SeamedMesh) -> None:
 
 
 def _describe(verdict: AtlasVerdict) -> str:
-    """Return the first lines of a verdict, joined into one line, and how to turn mirrored islands over."""
-    words = " ".join(verdict.summary().splitlines()[:3])
+    """Return the first lines of a verdict as sentences in one line, and how to turn mirrored islands over."""
+    lines = verdict.summary().splitlines()[:3]
+    words = " ".join(f"{line.replace('- island', 'Island').removesuffix('.')}." for line in lines)
     if verdict.mirrored.size:
         words += f" {QHM_OT_repair.bl_label} has the option Turn mirrored islands over."
     return words
-
-
-def _describe_others(here: surface.Surface, stored: SeamedMesh) -> str:
-    """Return a sentence on the islands that were left unchanged, and on those of them that overlap new ones."""
-    changed = np.zeros(len(stored.F), dtype=np.bool_)
-    changed[stored.mapped] = True
-    if changed.all():
-        return ""
-    verdict = atlas.certify(here.with_all(stored.uv))
-    new = np.array([changed[island.triangles].any() for island in verdict.islands])
-    if new.all():
-        return ""
-    pairs = verdict.overlapping[new[verdict.overlapping].sum(axis=1) == 1]
-    others = pairs[~new[pairs]] if len(pairs) else pairs
-    said = f" {count_of('other island', 'other islands', np.count_nonzero(~new))} unchanged"
-    return f"{said}, of which {len(np.unique(others))} overlap the new ones." if others.size else f"{said}."
 
 
 def _lying(mesh: SeamedMesh, verdict: AtlasVerdict) -> IntArray:
@@ -354,7 +340,8 @@ def _bent(mesh: SeamedMesh, polygons: Any, verdict: AtlasVerdict) -> IntArray:
     mirrored = polygons.of_triangle[_mirrored(verdict)]
     front, back = (find_concave(polygons, mesh.FT, mesh.uv * [side, 1.0]) for side in (1.0, -1.0))
     bent = np.union1d(np.setdiff1d(front, mirrored), np.intersect1d(back, mirrored))
-    return np.setdiff1d(bent, polygons.of_triangle[verdict.inverted])
+    shown = polygons.of_triangle[mesh.mapped]
+    return np.intersect1d(np.setdiff1d(bent, polygons.of_triangle[verdict.inverted]), shown)
 
 
 def _mirrored(verdict: AtlasVerdict) -> IntArray:

@@ -14,7 +14,7 @@ from quasiharmonic.apps.atlas.atlas_verdict import MIRROR, is_mirrored
 from quasiharmonic.atlas import AtlasVerdict
 from quasiharmonic.geometry.mesh.polygons import Polygons
 from quasiharmonic.io.seamed_mesh import SeamedMesh
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of
 
 from .rounding import in_single_precision
 
@@ -161,6 +161,37 @@ def certify(mesh: SeamedMesh) -> AtlasVerdict:
     if upright is mesh:
         return verdict
     return replace(verdict, islands=tuple(replace(island, mirrored=True) for island in verdict.islands))
+
+
+def describe_others(layers: Sequence[tuple[Surface, FloatArray, BoolArray]]) -> str:
+    """Return a sentence on the islands of UV layers that were left unchanged, and on those that overlap new ones.
+
+    Parameters
+    ----------
+    layers : sequence of tuple
+        Of each mesh in the texture: its surface, the positions of its loops (l, 2), and whether each triangle changed.
+    """
+    changed = np.concatenate([mask for _, _, mask in layers])
+    if changed.all():
+        return ""
+    vertices = np.cumsum([0, *(len(here.mesh.V) for here, _, _ in layers)])
+    loops = np.cumsum([0, *(len(uv) for _, uv, _ in layers)])
+    whole = [here.with_all(uv) for here, uv, _ in layers]
+    verdict = atlas.certify(
+        SeamedMesh(
+            np.concatenate([one.V for one in whole]),
+            np.concatenate([one.F + first for one, first in zip(whole, vertices[:-1], strict=True)]),
+            np.concatenate([one.FT + first for one, first in zip(whole, loops[:-1], strict=True)]),
+            np.concatenate([one.uv for one in whole]),
+        )
+    )
+    new = np.array([changed[island.triangles].any() for island in verdict.islands])
+    if new.all():
+        return ""
+    pairs = verdict.overlapping[new[verdict.overlapping].sum(axis=1) == 1]
+    others = pairs[~new[pairs]] if len(pairs) else pairs
+    said = f" {count_of('other island', 'other islands', np.count_nonzero(~new))} unchanged"
+    return f"{said}, of which {len(np.unique(others))} overlap the new ones." if others.size else f"{said}."
 
 
 def marked_edges(data: bpy.types.Mesh, mark: str) -> IntArray:

@@ -13,7 +13,7 @@ from quasiharmonic.util.arrays import count_of
 from quasiharmonic.util.options import SYMMETRIES
 
 from . import unwrapping
-from .job import Work, Working, find_objects
+from .job import Work, Working, list_names
 
 
 class QHM_OT_unwrap(Working):
@@ -81,7 +81,7 @@ class QHM_OT_unwrap(Working):
 
     def prepare(self, context: bpy.types.Context) -> Work:
         """Return the work that unwraps the objects."""
-        self._objects = find_objects(context, self.mode, self.edited)
+        self._objects = self.find_objects(context)
         self._parts = parts = unwrapping.read_parts(self._objects, edited=self.mode == "EDIT")
         # Islands with pinned UVs are not unwrapped, so the new ones must not lie over them.
         self._around = (self.around or any(part.pinned.any() for part in parts)) and not all(
@@ -107,7 +107,8 @@ class QHM_OT_unwrap(Working):
         """Write the texture coordinates and report them."""
         crossed = unwrapping.write_parts(self._parts, result, around=self._around, mark_seams=self.mark_seams)
         sound = result.success and not result.misses and not crossed
-        self.report({"INFO" if sound else "WARNING"}, f"{self.bl_label}: {describe_unwrap(result, crossed)}")
+        said = describe_unwrap(result, crossed) + unwrapping.describe_others(self._parts)
+        self.report({"INFO" if sound else "WARNING"}, f"{self.bl_label}: {said}")
         changes = ", ".join(f"{name}: {len(found)}" for name, found in result.cleaned.changes.items() if len(found))
         if changes:
             self.report({"INFO"}, f"{self.bl_label}: the mesh is unchanged, but was treated as if cleaned. {changes}")
@@ -118,12 +119,15 @@ class QHM_OT_unwrap(Working):
         if any(part.pinned.any() for part in self._parts):
             self.report({"INFO"}, f"{self.bl_label}: islands with pinned UVs stay as they are")
         if self.symmetry != "none":
-            for line in describe_symmetry(result.symmetry):
-                self.report({"INFO"}, f"{self.bl_label}: {line}")
+            found = result.symmetry
+            reason = found.reason or "seams are kept" * self.keep_seams
+            said = f"the symmetry in {self.symmetry} was not applied{reason and ': '}{reason}"
+            for line in describe_symmetry(found) or [said]:
+                self.report({"INFO" if found.applied else "WARNING"}, f"{self.bl_label}: {line}")
         changed = [thing.name for thing in self._objects if thing.modifiers]
         if changed:
-            names = ", ".join(changed[:3]) + (", …" if len(changed) > 3 else "")
-            self.report({"INFO"}, f"{self.bl_label}: the modifiers of {names} are ignored, the base mesh was unwrapped")
+            said = f"the modifiers of {list_names(changed)} are ignored, the base mesh was unwrapped"
+            self.report({"INFO"}, f"{self.bl_label}: {said}")
 
 
 def describe_unwrap(result: UnwrapResult, crossed: int) -> str:

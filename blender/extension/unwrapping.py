@@ -72,14 +72,13 @@ def read_parts(objects: Sequence[bpy.types.Object], *, edited: bool) -> list[Par
     Raises
     ------
     Refused
-        If there are no such faces, a mesh is linked from another file, or the scale of an object is not finite.
+        If there are no such faces, or the scale of an object is not finite.
     """
     parts: list[Part] = []
     for thing in objects:
         data = thing.data
         if any(part.data == data for part in parts) or not len(data.polygons):
             continue
-        surface.require_local(thing)
         if edited and numbers(data.polygons, "hide", 1, np.bool_).all():
             continue
         here = surface.read(data, edited=edited, chosen_only=False)
@@ -199,6 +198,13 @@ def write_parts(parts: Sequence[Part], result: UnwrapResult, *, around: bool, ma
         if mark_seams:
             _mark_seams(part, places, np.unique(face))
     return crossed
+
+
+def describe_others(parts: Sequence[Part]) -> str:
+    """Return a sentence on the islands of the parts that were not unwrapped, once the others are written."""
+    layers = [numbers(part.data.uv_layers.active.uv, "vector", 2, np.float32).astype(np.float64) for part in parts]
+    surfaces = [part.surface for part in parts]
+    return surface.describe_others(list(zip(surfaces, layers, (part.chosen for part in parts), strict=True)))
 
 
 def _stretch_of(matrix: FloatArray) -> FloatArray:

@@ -172,6 +172,14 @@ def test_check_tells_of_faces_that_are_not_convex(said):
     assert "1 face is not convex" in said()
 
 
+def test_check_calls_no_hidden_face_not_convex(said):
+    thing = scenes.add_quads()
+    thing.data.polygons[7].hide = thing.data.polygons[8].hide = True
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert bpy.ops.uv.qhm_check() == {"FINISHED"}
+    assert "not convex" not in said()
+
+
 def test_repair(thing):
     tangled(thing)
     before, kept = scenes.places(thing), scenes.everything_else(thing)

@@ -50,6 +50,11 @@ def test_symmetric_seams(said):
     bpy.ops.mesh.primitive_monkey_add()
     assert bpy.ops.uv.qhm_unwrap(symmetry="x") == {"FINISHED"}
     assert "not every triangle has a mirror image" in said()
+    scenes.add_quads()
+    for options, reason in [({}, "not every vertex has a mirror image"), ({"keep_seams": True}, "seams are kept")]:
+        assert bpy.ops.uv.qhm_unwrap(symmetry="z", **options) == {"FINISHED"}
+        (line,) = (line for line in said().splitlines() if reason in line)
+        assert line.startswith("Warning: Unwrap Model: ")
 
 
 def test_new_islands_are_placed_around_the_faces_that_are_not_selected():

@@ -47,9 +47,11 @@ def test_without_a_mesh(act):
     assert not getattr(bpy.ops.uv, f"qhm_{act}").poll()
 
 
-@pytest.mark.parametrize("act", ALL)
-def test_linked_from_another_file(act, tmp_path):
+@pytest.fixture
+def linked(tmp_path):
+    """A selected, active object of another file."""
     thing = scenes.add_quads()
+    thing.name = "linked"
     bpy.data.libraries.write(str(tmp_path / "other.blend"), {thing})
     bpy.data.objects.remove(thing)
     with bpy.data.libraries.load(str(tmp_path / "other.blend"), link=True) as (there, here):
@@ -58,10 +60,34 @@ def test_linked_from_another_file(act, tmp_path):
     bpy.context.collection.objects.link(thing)
     thing.select_set(True)
     bpy.context.view_layer.objects.active = thing
-    before = scenes.places(thing)
-    assert "linked from another file" in refused(act)
-    assert np.array_equal(scenes.places(thing), before)
+    yield thing
     bpy.data.libraries.remove(thing.data.library)
+
+
+@pytest.mark.parametrize("act", ALL)
+def test_linked_from_another_file(act, linked):
+    before = scenes.places(linked)
+    assert "linked from another file" in refused(act)
+    assert np.array_equal(scenes.places(linked), before)
+
+
+@pytest.mark.parametrize("act", ALL)
+def test_selected_objects_of_another_file_are_left_out_and_told(act, linked, said):
+    before = scenes.places(linked)
+    scenes.add_quads()
+    linked.select_set(True)
+    assert getattr(bpy.ops.uv, f"qhm_{act}")() == {"FINISHED"}
+    assert "linked from another file, so left unchanged: linked" in said()
+    assert np.array_equal(scenes.places(linked), before)
+
+
+def test_repair_reports_the_verdict_before_the_reasons(said):
+    thing = scenes.add_quads()
+    scenes.set_places(thing, 0 * scenes.places(thing))
+    assert bpy.ops.uv.qhm_repair() == {"FINISHED"}
+    (line,) = (line for line in said().splitlines() if "Repair UVs" in line)
+    assert line.startswith("Warning: Repair UVs: 1 island: 0 injective, 0 bijective. Island at triangle 0")
+    assert "No injective map exists" in line
 
 
 @pytest.mark.parametrize("act", ["flatten", "reduce_stretch"])

@@ -264,6 +264,18 @@ def test_hidden_and_unselected_faces_stay():
     assert set(np.flatnonzero(changed) // 4) == set(range(20, 24))
 
 
+@pytest.mark.parametrize("several", [False, True])
+def test_islands_left_unchanged_are_counted(several, said):
+    things = [scenes.two_squares([0, 0]) for _ in range(1 + several)]
+    for thing in things:
+        thing.select_set(True)
+        thing.data.polygons.foreach_set("hide", np.arange(32) < 16)
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert bpy.ops.uv.qhm_unwrap() == {"FINISHED"}
+    count = "2 other islands" if several else "1 other island"
+    assert f"{count} unchanged, of which {len(things)} overlap the new ones." in said()
+
+
 @pytest.mark.parametrize("edit", [False, True])
 def test_undo_gives_back_uvs_and_seams_of_all_objects(edit):
     things = [add_suzanne(), add_prism(), scenes.add_quads()]

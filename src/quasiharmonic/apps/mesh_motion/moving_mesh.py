@@ -22,6 +22,7 @@ from typing import NamedTuple, TypedDict, Unpack, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
+from quasiharmonic.apps.mesh_motion.morphing import make_way
 from quasiharmonic.apps.tetrahedra.tetrahedral_maps import MovingTetrahedra, is_volume
 from quasiharmonic.energies.energies import Energy
 from quasiharmonic.energies.measures import mean_ratio
@@ -175,9 +176,10 @@ class MovingMesh:
         Newton steps down the energy after each move. With 0 the mesh is also valid, and a step is faster.
     slide : bool or (m, 4) array
         Let the boundary vertices that are not moved slide along their outline, with fixed corners; in the plane this
-        needs ``settle`` of at least 1, and they lag one step behind the mesh, so moved vertices that arrive along the
-        same wall are blocked by them. `morph` does not have this limitation. Vertices of tetrahedra slide at once, as
-        in `morph`, along the flat parts of the first mesh's boundary or along those on the given planes.
+        needs ``settle`` of at least 1. They make way for moved vertices that arrive along the same straight wall, and
+        otherwise lag one step behind the mesh, so they block moved vertices along curved walls. `morph` does not have
+        this limitation. Vertices of tetrahedra slide at once, as in `morph`, along the flat parts of the first mesh's
+        boundary or along those on the given planes.
     linear_solver : str
         ``"auto"`` or one of `quasiharmonic.linsolve.available`.
 
@@ -293,11 +295,14 @@ class MovingMesh:
             return self._volume.advance(target)
         there = map_array("target", target, self._moved.size, finite=False)
         check_finite("target", "row", "rows", there)
-        goal = np.concatenate([there, self._points[self._domain.fixed[self._moved.size :]]])
+        goal = self._points.copy()
+        goal[self._moved] = there
+        if self._slide:
+            goal = make_way(True, self._domain.loops, self._points, goal, self._moved)
         try:
             # Overflow gives inf or NaN, and a step with either is never accepted.
             with np.errstate(all="ignore"):
-                share = self._descent.move(goal, _TUNING.tolerance, steps=25)
+                share = self._descent.move(goal[self._domain.fixed], _TUNING.tolerance, steps=25)
             if share < 1:
                 raise RuntimeError(
                     f"the boundary can be moved only {min(share, 0.999):.1%} of the way: then triangles become too "
