@@ -276,6 +276,17 @@ def test_a_forbidden_edge_is_no_longer_a_seam():
     assert not {(a, b), (c, d)} & {tuple(edge) for edge in one.session.state.mesh.seams.tolist()}
 
 
+def test_the_page_says_why_a_chosen_symmetry_was_not_applied(tmp_path):
+    V, F = starfish(3, 8)
+    io.write_obj(tmp_path / "star.obj", io.MeshData(V + 0.01 * np.random.default_rng(0).random(V.shape), F))
+    one = Visitor(tmp_path / "star.obj")
+    answers = one.does("unwrap", resolution=256, options={"symmetry": "y"})
+    assert "in y: not mirrored, not every vertex has a mirror image" in answers[-1].header["text"]
+    for symmetry in ("auto", "none"):
+        answers = one.does("unwrap", resolution=256, options={"symmetry": symmetry})
+        assert "note" not in [frame.header["kind"] for frame in answers]
+
+
 def test_options_reach_unwrap_and_wrong_ones_are_named(tmp_path):
     V, F = starfish(3, 8)
     io.write_obj(tmp_path / "star.obj", io.MeshData(V, F))

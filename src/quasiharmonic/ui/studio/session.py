@@ -149,7 +149,10 @@ class Session(PageUpdates):
             return
         if rule.busy and not rule.ahead:
             self._tell_busy(rule.busy)
-        self._keep(compute(), fit=rule.fit)
+        before, after = self.state, compute()
+        self._keep(after, fit=rule.fit)
+        if after.recipe.note and after.recipe is not before.recipe:
+            self._tell({"kind": "note", "level": "info", "text": after.recipe.note}, {})
 
     def _refuse_changed_seams(self) -> None:
         if self.state.wanted_seams is not None:
