@@ -231,6 +231,62 @@ def test_seams_are_required_forbidden_and_mirrored(tmp_path):
     assert len(one.session.state.forbidden) < len(forbidden)
 
 
+def along(one, low, high):
+    """Return the vertices of the page on the top row of a grid from one x to another."""
+    V = one.session.state.numbering.V
+    row = np.flatnonzero(V[:, 1] == V[:, 1].max())
+    (start,), (end,) = (row[np.isclose(V[row, 0], x)] for x in (low, high))
+    return {"start": int(start), "vertex": int(end)}
+
+
+def test_erase_removes_only_marks_of_the_nearest_kind():
+    one = Visitor(*grid(7, 2))
+    x = np.unique(one.session.state.numbering.V[:, 0])
+
+    def count():
+        return len(one.session.state.wanted_seams), len(one.session.state.forbidden)
+
+    def draw():
+        one.does("seam", **along(one, x[0], x[4]))
+        one.does("seam", **along(one, x[4], x[7]), forbid=True)
+        return along(one, x[1], x[6])
+
+    ends = draw()
+    assert count() == (4, 3)
+    one.does("erase", vertex=ends["vertex"])
+    assert count() == (4, 0)
+    draw()
+    one.does("erase", vertex=ends["start"])
+    assert count() == (0, 3)
+
+
+def test_a_forbidden_edge_is_no_longer_a_seam():
+    one = Visitor(*starfish(4, 6))
+    n = len(one.session.state.mesh.seams)
+    page = {int(v): k for k, v in enumerate(one.session.state.numbering.origin)}
+    (a, b), *_, (c, d) = one.session.state.mesh.seams.tolist()
+    one.does("seam", start=page[a], vertex=page[b], forbid=True)
+    assert one.session.state.wanted_seams is None
+    one.does("seam", start=page[c], vertex=page[d])
+    assert len(one.session.state.wanted_seams) == n - 1
+    one.does("seam", start=page[c], vertex=page[d], forbid=True)
+    assert len(one.session.state.wanted_seams) == n - 2
+    one.does("unwrap", resolution=256)
+    assert one.session.state.wanted_seams is None, "no error"
+    assert not {(a, b), (c, d)} & {tuple(edge) for edge in one.session.state.mesh.seams.tolist()}
+
+
+def test_the_page_says_why_a_chosen_symmetry_was_not_applied(tmp_path):
+    V, F = starfish(3, 8)
+    io.write_obj(tmp_path / "star.obj", io.MeshData(V + 0.01 * np.random.default_rng(0).random(V.shape), F))
+    one = Visitor(tmp_path / "star.obj")
+    answers = one.does("unwrap", resolution=256, options={"symmetry": "y"})
+    assert "in y: not mirrored, not every vertex has a mirror image" in answers[-1].header["text"]
+    for symmetry in ("auto", "none"):
+        answers = one.does("unwrap", resolution=256, options={"symmetry": symmetry})
+        assert "note" not in [frame.header["kind"] for frame in answers]
+
+
 def test_options_reach_unwrap_and_wrong_ones_are_named(tmp_path):
     V, F = starfish(3, 8)
     io.write_obj(tmp_path / "star.obj", io.MeshData(V, F))

@@ -88,6 +88,15 @@ def test_almost_symmetric_models_are_reported(symmetry):
     assert "not every vertex has a mirror image" in result.summary()
 
 
+@pytest.mark.parametrize("symmetry", ["auto", "y"])
+def test_a_model_without_symmetry_is_reported_if_an_axis_was_chosen(symmetry):
+    V, F = models.box()
+    result = unwrap(V * (1 + 0.1 * np.random.default_rng(0).random(V.shape)), F, resolution=256, symmetry=symmetry)
+    assert result.symmetry.share < 0.9
+    assert not result.symmetry.applied
+    assert ("not mirrored" in result.summary()) == (symmetry == "y") == bool(result.symmetry.reason)
+
+
 @pytest.mark.slow
 def test_differences_below_the_tolerance_are_not_seen():
     """The tolerance is 1e-6 of the diagonal."""

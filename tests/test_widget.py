@@ -10,6 +10,7 @@ from quasiharmonic.atlas import SeamedMesh, as_seamed_mesh
 from quasiharmonic.io import MeshData, checkerboard, own_texture, read_mesh, write_map
 from quasiharmonic.surfaces import disk
 from quasiharmonic.ui import notebook
+from quasiharmonic.ui.studio import session
 from quasiharmonic.ui.studio.page import bundle
 from quasiharmonic.ui.studio.protocol import decode, encode
 
@@ -128,8 +129,10 @@ def test_a_model_of_several_parts(cell):
     assert widget.mesh.uv.min() >= 0
     with pytest.raises(ValueError, match="max_stretch"):
         widget.unwrap(max_stretch=-1)
-    with pytest.raises(ValueError, match="a list of numbers below 2"):
+    with pytest.raises(ValueError, match=r"there is no island 7, only 0 \.\.\. 1"):
         widget.select([7])
+    widget.select(0)
+    assert widget.selected == [0]
     with pytest.raises(ValueError, match="islands must contain integer indices"):
         widget.select([0.9])
 
@@ -157,6 +160,26 @@ def test_image_selection_and_file_of_the_view(cell, tmp_path):
     assert own_texture(read_mesh(tmp_path / "two.glb")).data == board.data
     with pytest.raises(ValueError, match="not a PNG or JPEG"):
         widget.show_image(tmp_path / "two.obj")
+
+
+def test_an_interrupt_is_raised_and_the_widget_stays_usable(cell, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    widget = cell.show(V, F)
+    before = widget.mesh
+    with monkeypatch.context() as patch:
+        patch.setattr(session, "unwrap_model", interrupt)
+        patch.setattr(session, "make_first_state", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            widget.unwrap()
+        with pytest.raises(KeyboardInterrupt):
+            notebook.MapWidget(V, F)
+        # An interrupted action of the view leaves the map, without an error in the kernel.
+        cell.does("unwrap")
+        assert widget.mesh is before
+    widget.unwrap(resolution=256)
+    assert widget.mesh is not before
 
 
 def test_invalid_messages(cell):

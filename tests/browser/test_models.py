@@ -406,6 +406,24 @@ def test_two_fingers_zoom_and_one_drags(served_parts, browser):
     send("touchMove", (x + 40, y))
     send("touchEnd")
     assert page.evaluate("studio.view.hands.space().yaw") > 0.2
+    # Three fingers do not move an island of the map.
+    x, y = page.evaluate(
+        """() => {
+      const { scene, hands } = studio.view;
+      const [a, b, c] = [0, 1, 2].map((k) => scene.placeOf(scene.triangles[300 + k]));
+      return hands.plane.pointOf((a[0] + b[0] + c[0]) / 3, (a[1] + b[1] + c[1]) / 3);
+    }"""
+    )
+    box = page.locator("#view").bounding_box()
+    fingers = [(box["x"] + x, box["y"] + y), (box["x"] + x + 2, box["y"] + y), (box["x"] + x, box["y"] + y + 2)]
+    page.evaluate("() => { window.sent = []; studio.view.hands.send = (message) => window.sent.push(message.do); }")
+    for count in (1, 2, 3):
+        send("touchStart", *fingers[:count])
+    for k in range(1, 6):
+        send("touchMove", *((a, b + 6 * k) for a, b in fingers))
+    for count in (2, 1, 0):
+        send("touchEnd", *fingers[:count])
+    assert page.evaluate("sent") == []
     context.close()
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from quasiharmonic import certify, io, is_injective
+from quasiharmonic.io import checkerboard
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 10 10"><path d="M0 0 H10 V4 H4 V10 H0 Z"/></svg>'
 
@@ -159,6 +160,25 @@ def test_pin_undo_and_redo(address, opened, settled):
     assert page.evaluate("Array.from(studio.view.scene.places)") == before
     deed(page, settled, lambda: page.click("#redo"))
     assert page.evaluate("studio.view.scene.pins") == [pin]
+
+
+def test_the_first_drag_after_a_click_on_the_surface_moves_the_map(address, opened, settled):
+    page = opened(address)
+    box = page.locator(".qhm-surface").bounding_box()
+    for key, step in {"": 2, "v": -2, "Shift": 2}.items():
+        vertex = corner(page, 2)
+        before = page.evaluate("v => studio.view.scene.placeOf(v)", vertex)
+        page.mouse.click(box["x"] + 20, box["y"] + 20)
+        drag(page, vertex, [(4, -3)], release=False)
+        if key:  # A key that is released during the drag does not end it.
+            page.keyboard.press(key)
+        x, y = point_of(page, vertex)
+        for k in range(12):
+            page.mouse.move(x + step * k, y - step * k)
+            until(page, "!studio.view.hands.inFlight && !studio.view.hands.next")
+        deed(page, settled, page.mouse.up)
+        now = page.evaluate("v => studio.view.scene.placeOf(v)", vertex)
+        assert min(abs(now[0] - before[0]), abs(now[1] - before[1])) > 0.03, key
 
 
 def test_a_letter_is_saved_and_certified(address, opened, settled, tmp_path):
@@ -318,6 +338,12 @@ def test_invalid_or_large_files_are_reported_and_the_page_continues(address, ope
     page.set_input_files("#open", tmp_path / "notes.obj")
     page.wait_for_selector("#note:not([hidden])")
     assert "notes.obj" in page.inner_text("#note")
+    for name, content in {"wrong.png": b"Dear diary", "right.png": checkerboard().data}.items():
+        (tmp_path / name).write_bytes(content)
+        page.set_input_files("#image", tmp_path / name)
+        until(page, f"document.querySelector('#note').hidden === {str(name == 'right.png').lower()}")
+        until(page, f"Boolean(studio.panel.pictured) === {str(name == 'right.png').lower()}")
+    assert page.is_hidden("#note"), "the image is valid"
     # Four million triangles, as in a binary STL: rejected by their size before they are sent.
     with (tmp_path / "huge.stl").open("wb") as file:
         file.write(bytes(80) + (4_000_000).to_bytes(4, "little"))

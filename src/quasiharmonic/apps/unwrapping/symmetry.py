@@ -31,7 +31,7 @@ class Symmetry(NamedTuple):
     applied : bool
         Whether seams and charts are mirrored.
     reason : str
-        Why not; empty if they are.
+        Why not; empty if they are, and for ``"auto"`` if less than 90 % of the vertices have a mirror image.
     """
 
     axis: str | None
@@ -108,6 +108,8 @@ def find_mirror(V: FloatArray, F: IntArray, axis: str) -> tuple[Mirror | None, S
         if best.axis is None or share > best.share:
             missing = "not every triangle has a mirror image" if there.all() else "not every vertex has a mirror image"
             best = Symmetry(name, share, False, missing)
+    if axis == "auto" and best.share < _WORTH_REPORTING:
+        best = best._replace(reason="")
     return None, best
 
 
@@ -138,10 +140,10 @@ def check_symmetry(found: Symmetry, mirror: Mirror | None, chart: IntArray) -> S
 
 
 def describe_symmetry(found: Symmetry) -> list[str]:
-    """Return a line on the symmetry of a model, if most of its vertices have mirror images."""
+    """Return a line on the symmetry of a model, if an axis was chosen, or most vertices have mirror images."""
     if found.applied:
         return [f"symmetric in {found.axis}: seams and charts are mirrored"]
-    if found.share < _WORTH_REPORTING:
+    if not found.reason:
         return []
     return [
         f"{100 * found.share:.4g} % of the vertices have a mirror image in {found.axis}: not mirrored, {found.reason}"

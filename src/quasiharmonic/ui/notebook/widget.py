@@ -88,7 +88,8 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         self._changed = False
         sheet = _sheet(surface, F)
         self._session = Session(self._tell)
-        self._session.open(sheet)
+        if not self._session.open(sheet):
+            raise KeyboardInterrupt
         self._count()
         self.on_msg(self._receive)
 
@@ -113,9 +114,10 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
     def selected(self) -> list[int]:
         return list(self._session.state.selected)
 
-    def select(self, islands: Sequence[int]) -> None:
-        """Select islands, to which the other methods apply; raise ValueError if one does not exist."""
-        self._ask({"do": "select", "islands": index_array("islands", list(islands)).tolist()})
+    def select(self, islands: int | Sequence[int]) -> None:
+        """Select an island or several, to which the other methods apply; raise ValueError if one does not exist."""
+        chosen = [islands] if isinstance(islands, int | np.integer) else list(islands)
+        self._ask({"do": "select", "islands": index_array("islands", chosen).tolist()})
 
     def unwrap(self, *, max_stretch: float = 1.5, resolution: int = 2048, padding: float = 4) -> None:
         """Unwrap the whole model, as `quasiharmonic.unwrap` does; raise ValueError if that is not possible."""
@@ -162,10 +164,15 @@ class MapWidget(anywidget.AnyWidget):  # type: ignore[misc]
         self._ask({"do": "redo"})
 
     def _ask(self, header: dict[str, Any], arrays: Mapping[str, Array] | None = None) -> None:
-        """Handle a message as if from the view; raise ValueError with the message that the view would show."""
+        """Handle a message as if from the view; raise ValueError with the message that the view would show.
+
+        KeyboardInterrupt if the user interrupts the kernel.
+        """
         self._note = ""
-        self._session.handle(MessageFrame(header, dict(arrays or {})))
+        finished = self._session.handle(MessageFrame(header, dict(arrays or {})))
         self._count()
+        if not finished:
+            raise KeyboardInterrupt
         if self._note:
             raise ValueError(self._note)
 

@@ -34,6 +34,7 @@ class Recipe:
     outline: str | None = None  # The outline of the boundary
     anew: bool = True  # Whether the map was solved from scratch
     dragged: bool = False  # Whether the map ended a drag
+    note: str = ""  # What the call could not do
 
     @property
     def of_file(self) -> bool:

@@ -38,18 +38,22 @@ def draw_seam(state: SessionState, start: int, end: int, axis: str | None, *, fo
     V, F = state.mesh.V, state.mesh.F
     path = add_mirrored(shortest_path(V, F, start, end), V, F, axis)
     if forbid:
-        return replace(state, forbidden=add_edges(state.forbidden, path))
-    forbidden = remove_edges(state.forbidden, path, len(V))
-    return replace(state, wanted_seams=add_edges(find_seams(state), path), forbidden=forbidden)
+        wanted, forbidden = state.wanted_seams, add_edges(state.forbidden, path)
+    else:
+        wanted, forbidden = add_edges(find_seams(state), path), remove_edges(state.forbidden, path, len(V))
+    if wanted is not None:
+        wanted = remove_edges(wanted, forbidden, len(V))
+    return replace(state, wanted_seams=wanted, forbidden=forbidden)
 
 
 def erase_seam(state: SessionState, vertex: int, axis: str | None) -> SessionState:
     """Return the state without the chain nearest to a vertex, of seams or of edges that must not become seams."""
-    V, F, seams = state.mesh.V, state.mesh.F, find_seams(state)
-    chain = add_mirrored(find_chain(add_edges(seams, state.forbidden), V, vertex), V, F, axis)
-    left = remove_edges(seams, chain, len(V))
-    wanted = state.wanted_seams if len(left) == len(seams) else left
-    return replace(state, wanted_seams=wanted, forbidden=remove_edges(state.forbidden, chain, len(V)))
+    V, F, seams, forbidden = state.mesh.V, state.mesh.F, find_seams(state), state.forbidden
+    forbids = _distances(forbidden, V, vertex).min(initial=np.inf) <= _distances(seams, V, vertex).min(initial=np.inf)
+    chain = add_mirrored(find_chain(forbidden if forbids else seams, V, vertex), V, F, axis)
+    if forbids:
+        return replace(state, forbidden=remove_edges(forbidden, chain, len(V)))
+    return replace(state, wanted_seams=remove_edges(seams, add_edges(forbidden, chain), len(V)))
 
 
 def shortest_path(V: FloatArray, F: IntArray, start: int, end: int) -> IntArray:
@@ -86,10 +90,13 @@ def find_chain(seams: IntArray, V: FloatArray, vertex: int) -> IntArray:
     """Return the chain of seams (k, 2) that is nearest to a vertex; RequestError if there are none."""
     if not len(seams):
         raise RequestError("there are no seams")
-    middle = (V[seams[:, 0]] + V[seams[:, 1]]) / 2
-    nearest = int(np.argmin(((middle - V[vertex]) ** 2).sum(axis=1)))
     chains = _label_chains(seams)
-    return seams[chains == chains[nearest]]
+    return seams[chains == chains[np.argmin(_distances(seams, V, vertex))]]
+
+
+def _distances(edges: IntArray, V: FloatArray, vertex: int) -> FloatArray:
+    """Return the distance (k,) of the middle of each edge from a vertex."""
+    return np.asarray(np.linalg.norm((V[edges[:, 0]] + V[edges[:, 1]]) / 2 - V[vertex], axis=1))
 
 
 def add_mirrored(edges: IntArray, V: FloatArray, F: IntArray, axis: str | None) -> IntArray:

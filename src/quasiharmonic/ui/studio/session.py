@@ -77,9 +77,10 @@ _MAP_TO_OUTLINE = Operation("finding the map", fit=True)
 class Session(PageUpdates):
     """Session of one page: handles its messages."""
 
-    def open(self, sheet: PageSurface | None = None) -> None:
+    def open(self, sheet: PageSurface | None = None) -> bool:
         """Open a model, by default a built-in one; its surface is shown before there is a map.
 
+        Return False if an interrupt ended the search for the map.
         ValueError if the model cannot be opened; the page then keeps its previous one.
         """
         sheet = make_first_sheet() if sheet is None else sheet
@@ -98,6 +99,7 @@ class Session(PageUpdates):
             what = "the new charts are right of them" if first.mapped else "press Unwrap to map only these triangles"
             text = f"{len(sheet.unmapped)} of {len(sheet.surface.F)} triangles of {sheet.name} lack texture coordinates"
             self._tell({"kind": "note", "level": "info", "text": f"{text}; the others keep theirs: {what}"}, {})
+        return first is not bare
 
     def restore(self) -> bool:
         """Continue the stored session; return whether there is one."""
@@ -107,8 +109,8 @@ class Session(PageUpdates):
         self._send_image()
         return True
 
-    def handle(self, frame: MessageFrame) -> None:
-        """Execute the command of a message by the method ``_do_COMMAND``.
+    def handle(self, frame: MessageFrame) -> bool:
+        """Execute the command of a message by the method ``_do_COMMAND``; return False if an interrupt ended it.
 
         Errors of any type are sent to the page, and the state stays.
         """
@@ -120,8 +122,10 @@ class Session(PageUpdates):
             do(frame)
         except operations.Interrupted as end:
             self._keep_best(end)
+            return False
         except KeyboardInterrupt:
             self._show()
+            return False
         except Exception as error:
             self._drag_state = None
             if self._history and (self._working or not isinstance(error, RequestError)):
@@ -130,6 +134,7 @@ class Session(PageUpdates):
             known = isinstance(error, ValueError | OSError | ArithmeticError | RuntimeError | ImportError)
             text = str(error) if known else f"unexpected {type(error).__name__}: {error}"
             self._tell({"kind": "note", "level": "error", "text": text}, {})
+        return True
 
     def _perform(self, rule: Operation, plan: Planner, frame: MessageFrame) -> None:
         """Perform an operation in the order that the docstring of the module states."""
@@ -144,7 +149,10 @@ class Session(PageUpdates):
             return
         if rule.busy and not rule.ahead:
             self._tell_busy(rule.busy)
-        self._keep(compute(), fit=rule.fit)
+        before, after = self.state, compute()
+        self._keep(after, fit=rule.fit)
+        if after.recipe.note and after.recipe is not before.recipe:
+            self._tell({"kind": "note", "level": "info", "text": after.recipe.note}, {})
 
     def _refuse_changed_seams(self) -> None:
         if self.state.wanted_seams is not None:

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.model_files import PARTS, has_parts, polygon_costs, statement_labels
-from quasiharmonic.apps.unwrapping.result import UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.unwrapping.result import UnwrapResult, UnwrapStatus, UnwrapStep
+from quasiharmonic.apps.unwrapping.symmetry import describe_symmetry
 from quasiharmonic.apps.unwrapping.unwrap import unwrap
 from quasiharmonic.geometry.mesh.topology import are_sides
 from quasiharmonic.io import read_mesh
@@ -85,6 +86,7 @@ def unwrap_model(
     # A call that was stopped cannot be repeated.
     stopped = result.status is UnwrapStatus.TIME_LIMIT
     recipe = record_start(mapped) if stopped else _record_unwrap(source, options)
+    recipe = replace(recipe, note=_describe_missing_symmetry(result, given))
     return replace(rebuild_from_mesh(state, mapped, recipe), from_file=False).select_all()
 
 
@@ -141,7 +143,14 @@ def _unwrap_rest(state: SessionState, callback: Callback, options: dict[str, Any
     right = np.ceil(uv[np.delete(FT, sheet.unmapped, axis=0), 0].max())
     FT[sheet.unmapped] = result.indices + len(uv)
     mapped = SeamedMesh(surface.V, surface.F, FT, np.concatenate([uv, result.uvs + np.array([right, 0.0])]))
-    return replace(rebuild_from_mesh(state, mapped, record_start(mapped)), from_file=False).select_all()
+    recipe = replace(record_start(mapped), note=_describe_missing_symmetry(result, options))
+    return replace(rebuild_from_mesh(state, mapped, recipe), from_file=False).select_all()
+
+
+def _describe_missing_symmetry(result: UnwrapResult, options: dict[str, Any]) -> str:
+    """Return why seams and charts are not mirrored along the axis in the options; empty if they are, or without one."""
+    chosen = options.get("symmetry") in ("x", "y", "z") and not result.symmetry.applied
+    return "".join(describe_symmetry(result.symmetry)) if chosen else ""
 
 
 def _label_triangles(sheet: PageSurface, which: str) -> IntArray:

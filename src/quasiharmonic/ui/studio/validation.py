@@ -121,8 +121,10 @@ def read_amount(frame: MessageFrame, name: str, low: float, high: float, default
 def read_indices(frame: MessageFrame, name: str, n: int) -> list[int]:
     """Return a list of different indices below ``n``, ascending."""
     values = frame.header.get(name)
-    if not isinstance(values, list) or not all(type(value) is int and 0 <= value < n for value in values):
-        raise RequestError(f"the message lacks {name}, a list of numbers below {n}")
+    if not isinstance(values, list) or not all(type(value) is int for value in values):
+        raise RequestError(f"the message lacks {name}, a list of whole numbers")
+    if wrong := [value for value in values if not 0 <= value < n]:
+        raise RequestError(f"there is no {name.removesuffix('s')} {wrong[0]}, only 0 ... {n - 1}")
     return sorted(set(values))
 
 

@@ -61,8 +61,11 @@ export class Hands {
     pane.addEventListener("keydown", (event) => {
       if (!event.ctrlKey && !event.metaKey && !event.altKey && this[`${name}Key`](event)) event.preventDefault();
     });
-    pane.addEventListener("keyup", () => this.#letGo());
-    pane.addEventListener("blur", () => this.#letGo());
+    if (name === "map") {
+      // A released key ends a drag by keys, not one with the pointer.
+      pane.addEventListener("keyup", () => this.from || this.#letGo());
+      pane.addEventListener("blur", () => this.#letGo());
+    }
     element.append(pane);
     return pane;
   }
@@ -127,7 +130,7 @@ export class Hands {
 
   surfaceUp(event, point) {
     const clicked = this.from && Math.hypot(point[0] - this.from[0], point[1] - this.from[1]) < CLICK;
-    this.last = null;
+    this.from = this.last = null;
     if (!clicked || event.type !== "pointerup" || !this.send) return;
     const { scene, tool } = this;
     const hit = this.space()?.pick(point, scene.triangles);
@@ -406,22 +409,22 @@ export class Hands {
   }
 }
 
-/** Two fingers on a pane: calls `changed(factor, dx, dy, middle)` when they move. */
+/** Two or more fingers on a pane: calls `changed(factor, dx, dy, middle)` when the first two move. */
 class Pinch {
   constructor(changed) {
     this.changed = changed;
     this.fingers = new Map();
   }
 
-  /** Return whether two fingers are down now. */
+  /** Return whether two or more fingers are down now. */
   down(id, point) {
     this.fingers.set(id, point);
-    return this.fingers.size === 2;
+    return this.fingers.size >= 2;
   }
 
   move(id, point) {
     if (!this.fingers.has(id)) return false;
-    if (this.fingers.size !== 2) {
+    if (this.fingers.size < 2) {
       this.fingers.set(id, point);
       return false;
     }
@@ -434,9 +437,9 @@ class Pinch {
     return true;
   }
 
-  /** Return whether two fingers were down. */
+  /** Return whether two or more fingers were down. */
   up(id) {
-    const two = this.fingers.size === 2;
+    const two = this.fingers.size >= 2;
     this.fingers.delete(id);
     return two;
   }

@@ -106,7 +106,7 @@ class Page {
     const content = new Uint8Array(await file.arrayBuffer());
     const suffix = file.name.toLowerCase().split(".").pop();
     const what = { svg: "drawing", png: "image", jpg: "image", jpeg: "image" }[suffix] ?? "load";
-    if (what === "load") this.panel.status.forget();
+    if (what !== "drawing") this.panel.status.forget();
     this.send({ do: what, name: file.name.slice(-200) }, { content });
   }
 

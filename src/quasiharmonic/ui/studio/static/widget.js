@@ -46,6 +46,7 @@ export function render({ model, el }) {
   let saves = false; // whether this view asked for files
   let selected = [];
   let listed = "";
+  let verdict = ["", "good"]; // on the map that is shown
   const send = (message, arrays) => model.send({}, undefined, [encodeFrame(message, arrays)]);
   const view = createView(box, { send, pictured: (picture) => picture && colour("image") });
   // In JupyterLab, keys in the view would also insert and delete cells.
@@ -151,7 +152,8 @@ export function render({ model, el }) {
     else if (header.kind === "busy") say(`${header.what} …`, "good");
     else if (header.kind === "file") return saves && download(header.name, arrays.content);
     else if (header.kind === "saved") saves = false;
-    else if (header.kind === "map" && arrays.places) say(header.verdict, header.injective ? "good" : "error");
+    else if (header.kind === "map" && arrays.places) say(...(verdict = [header.verdict, header.injective ? "good" : "error"]));
+    else if (header.kind === "image") say(...verdict);
     if (header.kind === "map" && header.state === "settled") {
       list(header);
       for (const what of ["undo", "redo"]) {
