@@ -4,8 +4,8 @@ Move some nodes of a mesh and place the others such that no element is inverted:
 nodes, quadrilaterals of four, or tetrahedra of four. Boundary nodes without a displacement stay fixed; mid-side nodes
 move with their sides. Only positions change in the file; data, time steps and physical groups stay unchanged.
 
-Exit status: 0 no element of the written mesh is inverted, verified exactly, and tetrahedra cover no point twice; 1
-otherwise; 2 wrong input or call, nothing written; 3 written, but the report failed.
+Exit status: 0 all steps are done, no element of the written mesh is inverted, verified exactly, and tetrahedra cover no
+point twice; 1 otherwise; 2 wrong input or call, nothing written; 3 written, but the report failed.
 
     qhm morph mesh.msh --positions boundary.csv -o moved.msh
     qhm morph mesh.vtu --field displacement --slide -o moved.vtu
@@ -134,7 +134,7 @@ def _morph_planar(options: argparse.Namespace, mesh: FemMesh) -> int:
     moved = _targets(options, mesh, lambda: rim(mesh.F), slide=options.slide)
     energy = None if options.no_polish else options.energy or "symmetric-dirichlet"
     given = {"energy": energy, "linear_solver": options.linear_solver, "slide": options.slide, "rest": rest}
-    morphed, notes = _morph(options, mesh, moved, given)
+    morphed, notes, complete = _morph(options, mesh, moved, given)
     assert isinstance(morphed, MorphResult)
     write_fem(options.output, mesh, morphed.points)
 
@@ -151,7 +151,7 @@ def _morph_planar(options: argparse.Namespace, mesh: FemMesh) -> int:
             **pipeline.name_files(options),
         }
         lines = [*_sentences(morphed, len(inverted), drift, options.output), *notes]
-        return pipeline.Account(facts, lines, not inverted.size)
+        return pipeline.Account(facts, lines, complete and not inverted.size)
 
     return pipeline.finish(options, describe, options.output)
 
@@ -176,7 +176,7 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
         options, mesh, lambda: np.unique(inspect_faces(mesh.F, len(mesh.points)).boundary), slide=bool(slide)
     )
     given = {"energy": None if options.no_polish else "symmetric-dirichlet", "slide": slide, "rest": rest}
-    morphed, notes = _morph(options, mesh, moved, given)
+    morphed, notes, complete = _morph(options, mesh, moved, given)
     assert isinstance(morphed, TetrahedraResult)
     write_fem(options.output, mesh, morphed.points)
 
@@ -205,7 +205,7 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
         if slide:
             lines.append(f"{count_of('boundary vertex', 'boundary vertices', len(morphed.sliding))} could slide")
         lines += [morphed.describe_quality(), *notes]
-        return pipeline.Account(facts, lines, bool(certificate.injective))
+        return pipeline.Account(facts, lines, complete and bool(certificate.injective))
 
     return pipeline.finish(options, describe, options.output)
 
@@ -242,11 +242,11 @@ def _targets(
 
 def _morph(
     options: argparse.Namespace, mesh: FemMesh, moved: Moved, given: dict[str, Any]
-) -> tuple[MorphResult | TetrahedraResult, list[str]]:
+) -> tuple[MorphResult | TetrahedraResult, list[str], bool]:
     """Morph in as many steps as requested, with progress on the terminal, and write the series of the steps.
 
-    The result compares the last mesh with the first one. The steps end where one of them fails. Also return a sentence
-    about the series.
+    The result compares the last mesh with the first one. The steps end where one of them fails. Also return
+    sentences about the series and an interrupt, and whether all steps are done.
     """
     from dataclasses import replace
 
@@ -274,7 +274,10 @@ def _morph(
         paths = list_series(options.output, steps)
         write_series(paths, elements, frames)
         notes.append(f"wrote {paths[0]}: {len(results)} of {steps} steps")
-    return replace(last, points_before=mesh.points, quality_before=first.quality_before), notes
+    if last.status.name == "INTERRUPTED" and not last.inverted.size:
+        notes.append(last.message)
+    complete = len(results) == steps
+    return replace(last, points_before=mesh.points, quality_before=first.quality_before), notes, complete
 
 
 def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output: Path) -> list[str]:
