@@ -40,7 +40,8 @@ def has_elements(path: Path, others: tuple[str, ...] = ()) -> bool:
 
 
 def check(options: argparse.Namespace) -> int:
-    """Report what the mesh is and which elements are inverted; return the exit status of ``qhm check``."""
+    """Report what the mesh is and which elements are inverted or overlap; return the exit status of ``qhm check``."""
+    from quasiharmonic.apps.mesh_motion.morph_result import describe_overlap
     from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
     from quasiharmonic.geometry.mesh.elements import covering_triangles, name_elements
     from quasiharmonic.io.fem.files import read_fem, read_volume
@@ -57,15 +58,17 @@ def check(options: argparse.Namespace) -> int:
         found = inspect_mesh(mesh.points, covering_triangles(mesh.F)[0])
     elements = count_of("element", "elements", len(mesh.F))
     verdict = f"inverted: {name_elements(mesh.F, inverted)}" if inverted.size else f"None of {elements} is inverted."
+    overlapping, overlap = (inverted[:0], []) if inverted.size else describe_overlap(mesh.F, mesh.points)
     facts = {
         "input": str(options.input),
         "mesh": found.to_dict(),
         "elements": len(mesh.F),
         "injective": not inverted.size,
         "inverted": inverted.tolist(),
+        "overlapping": overlapping.tolist(),
     }
     first = f"{options.input}: {elements}, split into triangles: {found.summary()}"
-    return pipeline.conclude(options, pipeline.Account(facts, [first, verdict], not inverted.size))
+    return pipeline.conclude(options, pipeline.Account(facts, [first, verdict, *overlap], not inverted.size))
 
 
 def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:

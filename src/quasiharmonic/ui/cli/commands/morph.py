@@ -129,6 +129,7 @@ def _morph_planar(options: argparse.Namespace, mesh: FemMesh) -> int:
     from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
     from quasiharmonic.geometry.mesh.elements import rim
     from quasiharmonic.io.fem.files import read_fem, write_fem
+    from quasiharmonic.util.arrays import count_of
 
     rest = _rest(options.rest, mesh, read_fem)
     moved = _targets(options, mesh, lambda: rim(mesh.F), slide=options.slide)
@@ -142,15 +143,20 @@ def _morph_planar(options: argparse.Namespace, mesh: FemMesh) -> int:
         # Certify the file as read back, because a format may store fewer digits.
         inverted = inverted_elements(morphed.F, read_fem(options.output).points)
         drift = None if rest is None else morphed.drift()
+        reversed_rows = int((morphed.F != mesh.F).any(axis=1).sum())
         facts = {
             **morphed.to_dict(),
             "injective": not inverted.size,
             "inverted": inverted.tolist(),
             "drift": drift if drift is None or isfinite(drift) else None,
             "moved": len(moved[0]),
+            "reversed": reversed_rows,
             **pipeline.name_files(options),
         }
-        lines = [*_sentences(morphed, len(inverted), drift, options.output), *notes]
+        lines = _sentences(morphed, len(inverted), drift, options.output)
+        if reversed_rows:
+            lines.append(_describe_reversed(count_of("element", "elements", reversed_rows)))
+        lines += notes
         return pipeline.Account(facts, lines, complete and not inverted.size)
 
     return pipeline.finish(options, describe, options.output)
@@ -197,11 +203,7 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
         if not certificate.injective:
             lines += morphed.summary().splitlines()[:-1]
         if reversed_rows:
-            lines.append(
-                f"The file lists {count_of('tetrahedron', 'tetrahedra', reversed_rows)} in the opposite order of "
-                "vertices. They are verified in the order that is positive at rest, but `qhm check` reports them as "
-                "inverted."
-            )
+            lines.append(_describe_reversed(count_of("tetrahedron", "tetrahedra", reversed_rows)))
         if slide:
             lines.append(f"{count_of('boundary vertex', 'boundary vertices', len(morphed.sliding))} could slide")
         lines += [morphed.describe_quality(), *notes]
@@ -281,13 +283,15 @@ def _morph(
 
 
 def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output: Path) -> list[str]:
+    from quasiharmonic.apps.mesh_motion.morph_result import describe_overlap
+
     what = "triangle" if morphed.F.shape[1] != 4 else "quadrilateral"
     verdict = f"{inverted} of {len(morphed.F)} {what}s are not positive" if inverted else f"every {what} is positive"
     lines = [f"wrote {output}: {verdict}"]
     if inverted:
         lines += [morphed.result.status.value] if morphed.valid else morphed.summary().splitlines()[:-1]
-    elif not morphed.result.certificate.bijective:
-        lines.append(f"but the mesh overlaps itself. {morphed.result.certificate.summary()}")
+    else:
+        lines += describe_overlap(morphed.F, morphed.points)[1]
     lines.append(morphed.describe_quality())
     if drift is not None:
         lines.append(
@@ -296,6 +300,13 @@ def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output:
             else "one step from the rest mesh finds no valid mesh, so the drift is unknown"
         )
     return lines
+
+
+def _describe_reversed(elements: str) -> str:
+    return (
+        f"The file lists {elements} in the opposite order of vertices. They are verified in the order that is positive "
+        "at rest, but `qhm check` and `qhm measure` report them as inverted."
+    )
 
 
 def _positions(path: Path, n: int, axes: int) -> tuple[IntArray, FloatArray]:
