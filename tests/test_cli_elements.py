@@ -95,6 +95,25 @@ def test_morph_names_clockwise_elements(tmp_path, capsys, name):
     assert (status, facts["inverted"]) == (1, [0])
 
 
+def test_sliding_needs_polishing(tmp_path, capsys):
+    source = write_vtk(tmp_path / "a.vtk", SQUARE, *CELLS["triangles"])
+    (tmp_path / "to.csv").write_text("0,-0.1,-0.1\n")
+    call = "-o", str(tmp_path / "b.vtk"), "--positions", str(tmp_path / "to.csv")
+    assert main(["morph", str(source), *call, "--slide", "--no-polish"]) == 2
+    assert "--slide of planar meshes needs polishing: omit --no-polish" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("call", [("measure",), ("plot", "-o", "a.png")])
+def test_points_of_tetrahedra_must_be_finite(tmp_path, capsys, monkeypatch, call):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.vtk").write_text(
+        "# vtk DataFile Version 3.0\nmesh\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 5 double\n"
+        "nan 0 0 0 0 0 1 0 0 0 1 0 0 0 nan\nCELLS 1 5\n4 1 2 3 4\nCELL_TYPES 1\n10\n"
+    )
+    assert main([call[0], "a.vtk", *call[1:]]) == 2
+    assert "a.vtk: not finite at point 4 (0-based)" in capsys.readouterr().err
+
+
 def test_headings_and_quotes_of_positions(tmp_path, capsys):
     points, F = grid(4, 4)
     source, positions = write_vtk(tmp_path / "in.vtk", points, F, 5), tmp_path / "to.csv"

@@ -48,7 +48,7 @@ def test_six_node_elements_may_overlap():
     corners = np.array([(0, 0), (1, 0), (0, 1), (0.5, 0), (0.5, 0.5), (0, 0.5)])
     F = np.arange(12).reshape(2, 6)
     for shift, overlapping in ((0.1, [0, 1]), (1, [])):
-        found, text = describe_overlap(F, np.concatenate([corners, corners + (shift, 0)]))
+        found, text = describe_overlap(F, np.concatenate([corners, corners + np.array([shift, 0])]))
         assert found.tolist() == overlapping
         assert ["may overlap itself" in line for line in text] == [True] * bool(overlapping)
 

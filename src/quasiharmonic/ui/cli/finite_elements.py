@@ -139,14 +139,23 @@ def plot(options: argparse.Namespace) -> int:
 
 
 def read_tetrahedra(path: Path) -> FemMesh | None:
-    """Read a mesh of tetrahedra; None if the file has no elements with volume, MeshFileError if it has hexahedra."""
+    """Read a mesh of tetrahedra; None if the file has no elements with volume.
+
+    MeshFileError if it has hexahedra, or a corner is not finite.
+    """
+    import numpy as np
+
     from quasiharmonic.geometry.mesh.elements import split_solids
     from quasiharmonic.io.errors import MeshFileError
     from quasiharmonic.io.fem.files import read_volume
+    from quasiharmonic.util.arrays import names_of
 
     mesh = read_volume(path)
     if len(split_solids(mesh.F)[1]):
         raise MeshFileError(path, "has hexahedra", remedy="split them into tetrahedra")
+    lost = np.setdiff1d(mesh.F, np.flatnonzero(np.isfinite(mesh.points).all(axis=1)))
+    if lost.size:
+        raise MeshFileError(path, f"not finite at {names_of('point', 'points', lost)} (0-based)")
     return mesh if len(mesh.F) else None
 
 

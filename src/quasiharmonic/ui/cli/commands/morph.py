@@ -120,6 +120,8 @@ def run(options: argparse.Namespace) -> int:
         return _morph_volume(options, volume)
     if options.slide_plane is not None:
         raise ValueError("--slide-plane is for tetrahedra: use --slide for planar meshes")
+    if options.slide and options.no_polish:
+        raise ValueError("--slide of planar meshes needs polishing: omit --no-polish")
     return _morph_planar(options, read_fem(options.input))
 
 
