@@ -24,21 +24,6 @@ if TYPE_CHECKING:
     from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
-def has_elements(path: Path, others: tuple[str, ...] = ()) -> bool:
-    """Return whether a file is a finite-element mesh by its suffix.
-
-    MeshFileError if it is neither that nor a surface; the message also lists the suffixes ``others``.
-    """
-    from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.registry import is_surface_name, suffixes
-
-    suffix, elements = path.suffix.lower(), suffixes("read_elements")
-    if suffix in elements or not suffix or is_surface_name(path) or path.is_dir():
-        return suffix in elements
-    remedy = f"supported: {', '.join(suffixes('read') + elements + others)}"
-    raise MeshFileError(path, f"{suffix} files cannot be read", remedy=remedy)
-
-
 def check(options: argparse.Namespace) -> int:
     """Report what the mesh is and which elements are inverted or overlap; return the exit status of ``qhm check``."""
     from quasiharmonic.apps.mesh_motion.morph_result import describe_overlap
