@@ -91,11 +91,14 @@ def test_visibility_is_decided_exactly():
 
 def test_a_minimal_reason_is_given():
     problem, _ = OBSTRUCTED["nothing sees all"]
-    (found,) = diagnose(problem).obstructions
+    diagnosis = diagnose(problem)
+    (found,) = diagnosis.obstructions
     assert found.vertices[0] == 8
     seen = found.vertices[1:]
     assert 2 <= len(seen) < 8
     assert found.split.tolist() == [[8, k] for k in sorted(seen)]
+    # The command writes no meshes of finite elements.
+    assert "refine_problem, or for surface files qhm refine." in diagnosis.summary()
 
 
 def test_conditions_for_simple_targets_are_skipped_for_other_targets():

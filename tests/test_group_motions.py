@@ -224,15 +224,51 @@ def test_a_series_ends_like_its_last_file(tmp_path, capsys):
     assert facts["quality_after"]["minimum"] == pytest.approx(once.quality_after.min(), rel=1e-2)
 
 
-def test_a_solid_in_steps(tmp_path, capsys):
+@pytest.fixture
+def interrupts(monkeypatch):
+    """Interrupt the second call of `morph` when its mesh is valid."""
+    calls = []
+
+    def interrupt(step):
+        if not step.inverted:
+            raise KeyboardInterrupt
+
+    def interrupted(*args, **options):
+        calls.append(options)
+        return morph(*args, **options | ({"callback": interrupt} if len(calls) == 2 else {}))
+
+    monkeypatch.setattr("quasiharmonic.apps.mesh_motion.morphing.morph", interrupted)
+
+
+def test_an_interrupted_series_fails(tmp_path, capsys, interrupts):
+    assert call(tmp_path, "--group", "the body", "--rotate", "50", "--steps", "5")[0] == 1
+    written = capsys.readouterr().out
+    assert "every triangle is positive" in written
+    assert "2 of 5 steps\nInterrupted." in written
+
+
+def write_solid(path):
+    """Write a box with a flag at its upper nodes."""
     X, T = box(2, 2, 2)
     top = (X[:, 2] == X[:, 2].max()).astype(int)
-    (tmp_path / "a.vtk").write_text(
+    path.write_text(
         f"# vtk DataFile Version 3.0\nmesh\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS {len(X)} double\n"
         f"{in_rows(X.tolist())}\nCELLS {len(T)} {5 * len(T)}\n{in_rows([4, *row] for row in T.tolist())}\n"
         f"CELL_TYPES {len(T)}\n{'10 ' * len(T)}\n"
         f"POINT_DATA {len(X)}\nSCALARS top int 1\nLOOKUP_TABLE default\n{' '.join(map(str, top))}\n"
     )
+    return X, T, top
+
+
+def test_an_interrupted_series_of_a_solid_fails(tmp_path, capsys, interrupts):
+    write_solid(tmp_path / "a.vtk")
+    call = "morph", str(tmp_path / "a.vtk"), "-o", str(tmp_path / "b.vtk"), "--group", "top", "--translate", "0,0,0.2"
+    assert main([*call, "--steps", "3"]) == 1
+    assert "2 of 3 steps\nInterrupted." in capsys.readouterr().out
+
+
+def test_a_solid_in_steps(tmp_path, capsys):
+    X, T, top = write_solid(tmp_path / "a.vtk")
     source, out = str(tmp_path / "a.vtk"), tmp_path / "b.vtk"
     turn = "--group", "top", "--rotate", "20", "--axis", "1,1,1", "--centre", "0,0,0"
     assert main(["morph", source, "-o", str(out), *turn, "--steps", "2"]) in (0, 1)

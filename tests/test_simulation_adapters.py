@@ -265,3 +265,8 @@ def test_a_path_in_place_of_a_mesh(tmp_path):
     assert np.array_equal(morph(path, *dent(points)).points, morph(points, F, *dent(points)).points)
     with pytest.raises(MeshFileError):
         morph(tmp_path / "none.msh", *dent(points))
+
+
+def test_messages_on_unknown_files_list_formats_of_both_kinds():
+    with pytest.raises(MeshFileError, match=r"\.xdmf files cannot be read; supported: \.obj, .*\.msh, .*\.mesh$"):
+        morph("x.xdmf", [0], [[0, 0]])

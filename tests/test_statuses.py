@@ -128,6 +128,14 @@ def test_a_status_has_an_action_unless_the_work_is_complete(status):
     assert bool(ACTION.search(status.value)) is (status.name not in COMPLETE)
 
 
+def test_a_status_names_the_function_and_the_command_of_an_option():
+    """Most functions and commands that return a status lack the option."""
+    for status in [*Status, *TetrahedraStatus]:
+        for command, option in re.findall(r"(\S+ \S+:)? (--[a-z]+)", status.value):
+            assert command.startswith("qhm "), option
+        assert "(refine" not in status.value
+
+
 @pytest.mark.parametrize("kind", Kind, ids=str)
 def test_an_obstruction_has_an_action(kind):
     assert ACTION.search(kind.value)

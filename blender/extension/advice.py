@@ -26,7 +26,7 @@ ADVICE = {
     ),
     "repair it first (repair; qhm repair)": "use Repair UVs first",
     "make it injective first (quasiharmonic.repair, qhm repair)": "use Repair UVs first",
-    "refine_problem, or qhm refine on the command line": "subdivide the mesh there",
+    "refine_problem, or for surface files qhm refine": "subdivide the mesh there",
     Kind.REVERSED.value: "The border of the island is mirrored: use UV > Mirror first.",
 }
 

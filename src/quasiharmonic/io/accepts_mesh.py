@@ -10,7 +10,6 @@ import inspect
 from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from os import PathLike
-from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, overload
 
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike
 from quasiharmonic.geometry.mesh.elements import join_elements, split_solids
 from quasiharmonic.io.fem.files import read_fem, read_volume
 from quasiharmonic.io.objects import MeshLike, mesh_arrays, planar_arrays, stands_for_mesh, without_constant_z
-from quasiharmonic.io.registry import FilePath, suffixes
+from quasiharmonic.io.registry import FilePath, has_elements
 from quasiharmonic.util.arrays import FloatArray, IntArray, describe, index_array, vertex_array
 
 # Kinds of cells in meshio's and VTK's names: number of nodes of planar ones, solids, and those without area.
@@ -51,7 +50,7 @@ def simulation_cells(mesh: MeshLike) -> tuple[FloatArray, IntArray]:
     """
     what = describe(mesh)
     if isinstance(mesh, str | PathLike):
-        if Path(mesh).suffix.lower() not in suffixes("read_elements"):
+        if not has_elements(mesh):
             return planar_arrays(mesh)
         read = read_volume(mesh)
         T, H = split_solids(read.F)

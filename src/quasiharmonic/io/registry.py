@@ -237,6 +237,18 @@ def is_surface_name(path: FilePath) -> bool:
     return form is not None and form.read is not None
 
 
+def has_elements(path: FilePath, others: tuple[str, ...] = ()) -> bool:
+    """Return whether a file is a finite-element mesh by its suffix.
+
+    MeshFileError if it is neither that nor a surface; the message also lists the suffixes ``others``.
+    """
+    suffix, elements = Path(path).suffix.lower(), suffixes("read_elements")
+    if suffix in elements or not suffix or is_surface_name(path) or os.path.isdir(path):
+        return suffix in elements
+    remedy = f"supported: {', '.join(suffixes('read') + elements + others)}"
+    raise MeshFileError(path, f"{suffix} files cannot be read", remedy=remedy)
+
+
 def suffixes(*needs: Feature) -> tuple[str, ...]:
     """Return the suffixes of all formats that have some features."""
     return tuple(form.suffix for form in _formats(needs))

@@ -42,8 +42,8 @@ class Status(Enum):
     INJECTIVE = "Every triangle is strictly positive, verified exactly."
     STALLED = (
         "Stalled: some triangles are still inverted and the energy has converged to a positive value. "
-        "No known obstruction forbids a map, but this mesh and this target may still allow none. Permit a finer mesh "
-        "(refine=True; --refine), or move the target."
+        "No known obstruction forbids a map, but this mesh and this target may still allow none. Split the edges of "
+        "the inverted triangles (injective_map: refine=True; qhm map: --refine), or move the target."
     )
     IMPOSSIBLE = (
         "No such map exists for this mesh and this target. This is the best map found. Remove the "

@@ -308,7 +308,8 @@ def flatten_derivative(
         The derivative of the energy's minimum near ``uv``; this map is ``Derivative.uv``. Without fixed vertices, the
         derivative is that of the map nearest to ``uv`` (`quasiharmonic.apps.gradients.freedom`), although `flatten`
         would lay it out differently. Use functions that do not depend on the map's position and rotation. With one
-        fixed vertex the map can rotate about it, so the same holds for its rotation.
+        fixed vertex the map can rotate about it, so the same holds for its rotation. If the energy is independent of
+        scale (``"mips"``), the same holds for the map's size; without fixed vertices, this is the surface's area.
 
     Raises
     ------

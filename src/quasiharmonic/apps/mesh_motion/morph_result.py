@@ -9,8 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quasiharmonic.apps.tetrahedra.result import describe_qualities, summarise_qualities
+from quasiharmonic.geometry.exact.certificate import certify
 from quasiharmonic.geometry.exact.predicates import orientation
-from quasiharmonic.geometry.mesh.elements import corner_triangles, jacobian_coefficients, name_elements
+from quasiharmonic.geometry.exact.triangles import find_overlapping
+from quasiharmonic.geometry.mesh.elements import (
+    corner_triangles,
+    covering_triangles,
+    jacobian_coefficients,
+    name_elements,
+)
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.util.arrays import FloatArray, IntArray, count_of, mark
 from quasiharmonic.util.outcome import Displayable, OutcomeOf, SummarisedOutcome, as_plain
@@ -100,11 +107,7 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
         lines = [self.status.value] if ended_early else []
         if self.valid:
             lines += [f"None of {count_of('element', 'elements', len(self.F))} is inverted anywhere.", qualities]
-            if not self.result.certificate.bijective and self.F.shape[1] == 6:
-                lines.append("The straight triangles between the nodes overlap, so the mesh may overlap itself.")
-            elif not self.result.certificate.bijective:
-                lines.append(f"The mesh overlaps itself. {self.result.certificate.summary()}")
-            return "\n".join(lines)
+            return "\n".join([*lines, *describe_overlap(self.F, self.points)[1]])
         where = f"Inverted or degenerate somewhere: {name_elements(self.F, self.inverted)}."
         advice = " Move the boundary less or in several steps, and keep inner loops inside the outer loop."
         lines.append(where if ended_early else where + advice)
@@ -145,6 +148,21 @@ class MorphResult(SummarisedOutcome, OutcomeOf, Displayable):
             **as_plain(self, "success", "message", "valid", "inverted", "forbidden"),
             **summarise_qualities(self.quality_before, self.quality_after),
         }
+
+
+def describe_overlap(F: IntArray, points: FloatArray) -> tuple[IntArray, list[str]]:
+    """Return the elements (k,) that overlap others, and a sentence on them, if no element is inverted.
+
+    Elements that only touch do not overlap. Six-node elements are judged by straight triangles between their nodes.
+    """
+    triangles, of = covering_triangles(F)
+    certificate = certify(triangles, points)
+    if certificate.bijective:
+        return np.empty(0, dtype=np.int64), []
+    found = np.unique(of[find_overlapping(triangles, points)])
+    if F.shape[1] == 6 and (found.size or not certificate.injective):
+        return found, ["The straight triangles between the nodes overlap, so the mesh may overlap itself."]
+    return found, [f"The mesh overlaps itself: {name_elements(F, found)}."] if found.size else []
 
 
 def find_forbidden(F: IntArray, points: FloatArray, given: IntArray) -> IntArray:

@@ -7,7 +7,7 @@ import numpy as np
 from quasiharmonic.geometry.exact.box_pairs import box_pairs
 from quasiharmonic.geometry.exact.predicates import orientation, orientation_or_nonfinite, sure_orientation
 from quasiharmonic.geometry.mesh.polygons import Polygons
-from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, check_range, repeat_each
+from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, SignArray, check_range, morton_order, repeat_each
 from quasiharmonic.util.kernels import compiled
 from quasiharmonic.util.progress import heartbeat
 
@@ -114,13 +114,15 @@ def find_overlapping(F: IntArray, uv: FloatArray) -> IntArray:
     [0, 1, 2]
     """
     found = np.zeros(len(F), dtype=np.bool_)
-    corners = uv[F]
+    # Trees of boxes are tight only if consecutive triangles are close to each other.
+    order = morton_order(uv[F[:, 0]])
+    corners = uv[F[order]]
     for i, j in box_pairs(corners.min(axis=1), corners.max(axis=1)):
         heartbeat()
         one, other = corners[i], corners[j]
         apart = _is_separated_by_side(one, other)
         apart[~apart] = _is_separated_by_side(other[~apart], one[~apart])
-        found[i[~apart]] = found[j[~apart]] = True
+        found[order[i[~apart]]] = found[order[j[~apart]]] = True
     return np.flatnonzero(found)
 
 

@@ -228,7 +228,7 @@ class Diagnosis(Displayable):
             lines.append(f"  {kind.value}")
         if len(self.split):
             edges = count_of("edge", "edges", len(self.split))
-            lines.append(f"Splitting {edges} may help: refine_problem, or qhm refine on the command line.")
+            lines.append(f"Splitting {edges} may help: refine_problem, or for surface files qhm refine.")
         lines += [f"Not checked: {text}" for text in self.unchecked]
         return "\n".join(lines)
 

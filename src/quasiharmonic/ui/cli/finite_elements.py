@@ -24,23 +24,9 @@ if TYPE_CHECKING:
     from quasiharmonic.util.arrays import FloatArray, IntArray
 
 
-def has_elements(path: Path, others: tuple[str, ...] = ()) -> bool:
-    """Return whether a file is a finite-element mesh by its suffix.
-
-    MeshFileError if it is neither that nor a surface; the message also lists the suffixes ``others``.
-    """
-    from quasiharmonic.io.errors import MeshFileError
-    from quasiharmonic.io.registry import is_surface_name, suffixes
-
-    suffix, elements = path.suffix.lower(), suffixes("read_elements")
-    if suffix in elements or not suffix or is_surface_name(path) or path.is_dir():
-        return suffix in elements
-    remedy = f"supported: {', '.join(suffixes('read') + elements + others)}"
-    raise MeshFileError(path, f"{suffix} files cannot be read", remedy=remedy)
-
-
 def check(options: argparse.Namespace) -> int:
-    """Report what the mesh is and which elements are inverted; return the exit status of ``qhm check``."""
+    """Report what the mesh is and which elements are inverted or overlap; return the exit status of ``qhm check``."""
+    from quasiharmonic.apps.mesh_motion.morph_result import describe_overlap
     from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
     from quasiharmonic.geometry.mesh.elements import covering_triangles, name_elements
     from quasiharmonic.io.fem.files import read_fem, read_volume
@@ -57,15 +43,17 @@ def check(options: argparse.Namespace) -> int:
         found = inspect_mesh(mesh.points, covering_triangles(mesh.F)[0])
     elements = count_of("element", "elements", len(mesh.F))
     verdict = f"inverted: {name_elements(mesh.F, inverted)}" if inverted.size else f"None of {elements} is inverted."
+    overlapping, overlap = (inverted[:0], []) if inverted.size else describe_overlap(mesh.F, mesh.points)
     facts = {
         "input": str(options.input),
         "mesh": found.to_dict(),
         "elements": len(mesh.F),
         "injective": not inverted.size,
         "inverted": inverted.tolist(),
+        "overlapping": overlapping.tolist(),
     }
     first = f"{options.input}: {elements}, split into triangles: {found.summary()}"
-    return pipeline.conclude(options, pipeline.Account(facts, [first, verdict], not inverted.size))
+    return pipeline.conclude(options, pipeline.Account(facts, [first, verdict, *overlap], not inverted.size))
 
 
 def _check_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
@@ -136,14 +124,23 @@ def plot(options: argparse.Namespace) -> int:
 
 
 def read_tetrahedra(path: Path) -> FemMesh | None:
-    """Read a mesh of tetrahedra; None if the file has no elements with volume, MeshFileError if it has hexahedra."""
+    """Read a mesh of tetrahedra; None if the file has no elements with volume.
+
+    MeshFileError if it has hexahedra, or a corner is not finite.
+    """
+    import numpy as np
+
     from quasiharmonic.geometry.mesh.elements import split_solids
     from quasiharmonic.io.errors import MeshFileError
     from quasiharmonic.io.fem.files import read_volume
+    from quasiharmonic.util.arrays import names_of
 
     mesh = read_volume(path)
     if len(split_solids(mesh.F)[1]):
         raise MeshFileError(path, "has hexahedra", remedy="split them into tetrahedra")
+    lost = np.setdiff1d(mesh.F, np.flatnonzero(np.isfinite(mesh.points).all(axis=1)))
+    if lost.size:
+        raise MeshFileError(path, f"not finite at {names_of('point', 'points', lost)} (0-based)")
     return mesh if len(mesh.F) else None
 
 

@@ -79,6 +79,7 @@ def declare_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Read, inspect, certify, diagnose, report; or report the boundary."""
     from quasiharmonic import io
+    from quasiharmonic.io.registry import has_elements
     from quasiharmonic.problem.inspection import inspect_mesh
 
     if options.boundary and (options.precision or options.any_triangulation or options.fixed or options.weld):
@@ -91,7 +92,7 @@ def run(options: argparse.Namespace) -> int:
         return _list_boundary(options)
     if options.plot is not None:
         raise ValueError("--plot needs --boundary: add it, or use qhm plot")
-    if finite_elements.has_elements(options.input):
+    if has_elements(options.input):
         return finite_elements.check(options)
     mesh = io.read_mesh(options.input)
     fixed = None if options.fixed is None else io.read_handles(options.fixed, len(mesh.V))

@@ -42,13 +42,14 @@ def run(options: argparse.Namespace) -> int:
     from quasiharmonic import io
     from quasiharmonic.apps.atlas.atlas_verdict import mirrored_islands, reflect_mirrored
     from quasiharmonic.energies.measures import distortion
+    from quasiharmonic.io.registry import has_elements
     from quasiharmonic.util.arrays import names_of
 
     set_default(options, "rings", 20, asked=options.distances, belongs="--distances")
     if options.export is not None:
         io.find_format(options.export, "encode_values")
     report.check_new({"--export": options.export}, options.json, inputs=(options.input,))
-    if finite_elements.has_elements(options.input):
+    if has_elements(options.input):
         return finite_elements.measure(options)
     mesh = io.read_mesh(options.input)
     mapped = io.mapped(mesh)

@@ -4,8 +4,8 @@ Move some nodes of a mesh and place the others such that no element is inverted:
 nodes, quadrilaterals of four, or tetrahedra of four. Boundary nodes without a displacement stay fixed; mid-side nodes
 move with their sides. Only positions change in the file; data, time steps and physical groups stay unchanged.
 
-Exit status: 0 no element of the written mesh is inverted, verified exactly, and tetrahedra cover no point twice; 1
-otherwise; 2 wrong input or call, nothing written; 3 written, but the report failed.
+Exit status: 0 all steps are done, no element of the written mesh is inverted, verified exactly, and tetrahedra cover no
+point twice; 1 otherwise; 2 wrong input or call, nothing written; 3 written, but the report failed.
 
     qhm morph mesh.msh --positions boundary.csv -o moved.msh
     qhm morph mesh.vtu --field displacement --slide -o moved.vtu
@@ -121,6 +121,8 @@ def run(options: argparse.Namespace) -> int:
         return _morph_volume(options, volume)
     if options.slide_plane is not None:
         raise ValueError("--slide-plane is for tetrahedra: use --slide for planar meshes")
+    if options.slide and options.no_polish:
+        raise ValueError("--slide of planar meshes needs polishing: omit --no-polish")
     return _morph_planar(options, read_fem(options.input))
 
 
@@ -130,12 +132,13 @@ def _morph_planar(options: argparse.Namespace, mesh: FemMesh) -> int:
     from quasiharmonic.geometry.exact.jacobian_signs import inverted_elements
     from quasiharmonic.geometry.mesh.elements import rim
     from quasiharmonic.io.fem.files import read_fem, write_fem
+    from quasiharmonic.util.arrays import count_of
 
     rest = _rest(options.rest, mesh, read_fem)
     moved = _targets(options, mesh, lambda: rim(mesh.F), slide=options.slide)
     energy = None if options.no_polish else options.energy or "symmetric-dirichlet"
     given = {"energy": energy, "linear_solver": options.linear_solver, "slide": options.slide, "rest": rest}
-    morphed, notes = _morph(options, mesh, moved, given)
+    morphed, notes, complete = _morph(options, mesh, moved, given)
     assert isinstance(morphed, MorphResult)
     write_fem(options.output, mesh, morphed.points)
 
@@ -143,16 +146,21 @@ def _morph_planar(options: argparse.Namespace, mesh: FemMesh) -> int:
         # Certify the file as read back, because a format may store fewer digits.
         inverted = inverted_elements(morphed.F, read_fem(options.output).points)
         drift = None if rest is None else morphed.drift()
+        reversed_rows = int((morphed.F != mesh.F).any(axis=1).sum())
         facts = {
             **morphed.to_dict(),
             "injective": not inverted.size,
             "inverted": inverted.tolist(),
             "drift": drift if drift is None or isfinite(drift) else None,
             "moved": len(moved[0]),
+            "reversed": reversed_rows,
             **pipeline.name_files(options),
         }
-        lines = [*_sentences(morphed, len(inverted), drift, options.output), *notes]
-        return pipeline.Account(facts, lines, not inverted.size)
+        lines = _sentences(morphed, len(inverted), drift, options.output)
+        if reversed_rows:
+            lines.append(_describe_reversed(count_of("element", "elements", reversed_rows)))
+        lines += notes
+        return pipeline.Account(facts, lines, complete and not inverted.size)
 
     return pipeline.finish(options, describe, options.output)
 
@@ -177,7 +185,7 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
         options, mesh, lambda: np.unique(inspect_faces(mesh.F, len(mesh.points)).boundary), slide=bool(slide)
     )
     given = {"energy": None if options.no_polish else "symmetric-dirichlet", "slide": slide, "rest": rest}
-    morphed, notes = _morph(options, mesh, moved, given)
+    morphed, notes, complete = _morph(options, mesh, moved, given)
     assert isinstance(morphed, TetrahedraResult)
     write_fem(options.output, mesh, morphed.points)
 
@@ -198,15 +206,11 @@ def _morph_volume(options: argparse.Namespace, mesh: FemMesh) -> int:
         if not certificate.injective:
             lines += morphed.summary().splitlines()[:-1]
         if reversed_rows:
-            lines.append(
-                f"The file lists {count_of('tetrahedron', 'tetrahedra', reversed_rows)} in the opposite order of "
-                "vertices. They are verified in the order that is positive at rest, but `qhm check` reports them as "
-                "inverted."
-            )
+            lines.append(_describe_reversed(count_of("tetrahedron", "tetrahedra", reversed_rows)))
         if slide:
             lines.append(f"{count_of('boundary vertex', 'boundary vertices', len(morphed.sliding))} could slide")
         lines += [morphed.describe_quality(), *notes]
-        return pipeline.Account(facts, lines, bool(certificate.injective))
+        return pipeline.Account(facts, lines, complete and bool(certificate.injective))
 
     return pipeline.finish(options, describe, options.output)
 
@@ -243,11 +247,11 @@ def _targets(
 
 def _morph(
     options: argparse.Namespace, mesh: FemMesh, moved: Moved, given: dict[str, Any]
-) -> tuple[MorphResult | TetrahedraResult, list[str]]:
+) -> tuple[MorphResult | TetrahedraResult, list[str], bool]:
     """Morph in as many steps as requested, with progress on the terminal, and write the series of the steps.
 
-    The result compares the last mesh with the first one. The steps end where one of them fails. Also return a sentence
-    about the series.
+    The result compares the last mesh with the first one. The steps end where one of them fails. Also return
+    sentences about the series and an interrupt, and whether all steps are done.
     """
     from dataclasses import replace
 
@@ -275,17 +279,22 @@ def _morph(
         paths = list_series(options.output, steps)
         write_series(paths, elements, frames)
         notes.append(f"wrote {paths[0]}: {len(results)} of {steps} steps")
-    return replace(last, points_before=mesh.points, quality_before=first.quality_before), notes
+    if last.status.name == "INTERRUPTED" and not last.inverted.size:
+        notes.append(last.message)
+    complete = len(results) == steps
+    return replace(last, points_before=mesh.points, quality_before=first.quality_before), notes, complete
 
 
 def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output: Path) -> list[str]:
+    from quasiharmonic.apps.mesh_motion.morph_result import describe_overlap
+
     what = "triangle" if morphed.F.shape[1] != 4 else "quadrilateral"
     verdict = f"{inverted} of {len(morphed.F)} {what}s are not positive" if inverted else f"every {what} is positive"
     lines = [f"wrote {output}: {verdict}"]
     if inverted:
         lines += [morphed.result.status.value] if morphed.valid else morphed.summary().splitlines()[:-1]
-    elif not morphed.result.certificate.bijective:
-        lines.append(f"but the mesh overlaps itself. {morphed.result.certificate.summary()}")
+    else:
+        lines += describe_overlap(morphed.F, morphed.points)[1]
     lines.append(morphed.describe_quality())
     if drift is not None:
         lines.append(
@@ -294,6 +303,13 @@ def _sentences(morphed: MorphResult, inverted: int, drift: float | None, output:
             else "one step from the rest mesh finds no valid mesh, so the drift is unknown"
         )
     return lines
+
+
+def _describe_reversed(elements: str) -> str:
+    return (
+        f"The file lists {elements} in the opposite order of vertices. They are verified in the order that is positive "
+        "at rest, but `qhm check` and `qhm measure` report them as inverted."
+    )
 
 
 def _positions(path: Path, n: int, axes: int) -> tuple[IntArray, FloatArray]:

@@ -54,6 +54,7 @@ def run(options: argparse.Namespace) -> int:
     """Read and draw."""
     from quasiharmonic import io
     from quasiharmonic.io.fields import FIELD_SUFFIXES, read_field
+    from quasiharmonic.io.registry import has_elements
     from quasiharmonic.ui.plot import (
         plot_field,
         plot_unwrap,
@@ -72,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
         with report.name_source(options.input):
             save_picture(options.output, plot_field(given.field, spacing=given.spacing))
         return report.tell_written(options.output)
-    if finite_elements.has_elements(options.input, FIELD_SUFFIXES):
+    if has_elements(options.input, FIELD_SUFFIXES):
         return finite_elements.plot(options)
     shows_measure = options.kind == "distortion"
     set_default(options, "measure", "isometric", asked=shows_measure, belongs="--kind distortion")
