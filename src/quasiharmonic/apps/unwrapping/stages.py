@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY, Textures
 from quasiharmonic.apps.atlas.packing.pack import Packing
-from quasiharmonic.apps.unwrapping.chart import Chart, number_kinds
+from quasiharmonic.apps.unwrapping.chart import Chart, find_textures, number_kinds
 from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, divide_long_charts, mend_charts
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
@@ -95,6 +95,11 @@ class Task:
     points: FloatArray
     rules: Rules
     density: float | None
+
+    @property
+    def cleaned_tile(self) -> IntArray | None:
+        """Tile (f',) of each triangle of the cleaned mesh, with ``tile_by``."""
+        return None if self.tile is None else self.tile[self.cleaned.triangles]
 
     @property
     def bound(self) -> float:
@@ -197,6 +202,7 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
     # Beside kept charts, it is unknown how long charts may be.
     density = task.density if task.kept is None else None
     divide = partial(divide_long_charts, wanted=wanted, size=task.size, density=density)
+    texture = find_textures(task.cleaned_tile, wanted.stack, rules.mirror, points, cleaned.F)
     textures = Textures(task.size, float(wanted.padding), wanted.tiles, wanted.rotate)
     charts = find_charts(
         points,
@@ -208,7 +214,7 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
         uv=None if rules.uv is None else rules.uv[rest],
         mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
         draft=draft,
-        choose=LayoutChoice(divide, textures, float(wanted.packing_loss)),
+        choose=LayoutChoice(divide, textures, float(wanted.packing_loss), texture[rest]),
         callback=task.report,
         jobs=wanted.jobs,
     )
@@ -217,7 +223,7 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
         charts = [*straight, *(replace(chart, triangles=np.flatnonzero(rest)[chart.triangles]) for chart in charts)]
     if rules.uv is not None:
         return sorted(charts, key=lambda chart: int(chart.triangles[0]))
-    return divide(charts, points, rules.cost)
+    return divide(charts, points, rules.cost, texture)
 
 
 def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:
@@ -253,7 +259,7 @@ def _pack(task: Task, charts: list[Chart], *, closely: int) -> Packing:
     kept = task.kept
     return place_charts(
         charts,
-        None if task.tile is None else task.tile[task.cleaned.triangles],
+        task.cleaned_tile,
         task.wanted,
         task.size,
         task.density,
