@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+import hard_models
 from quasiharmonic import is_injective, surfaces, unwrap
 from quasiharmonic.apps.atlas.packing import bitmap_search
 from quasiharmonic.apps.atlas.packing.shapes import convex_hull
@@ -154,6 +155,33 @@ def test_a_given_density_is_kept():
     sufficient = int(str(raised.value).split("resolution=")[1].split()[0])
     assert sufficient < 1700
     check(charts, pack_charts(charts, resolution=sufficient, texels_per_unit=3 * largest), [sufficient] * 2, 4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2, 12, 60])
+def test_a_density_that_was_found_is_accepted(count):
+    charts = [surfaces.annulus(3 + k % 2) if k % 3 else surfaces.grid(2, 2) for k in range(count)]
+    charts = [(uv * [1, 0.4 + 0.05 * (k % 7)], F) for k, (uv, F) in enumerate(charts)]
+    largest = pack_charts(charts, resolution=128).texels_per_unit
+    for share in (1, 0.9995, 0.99, 0.97):
+        packing = pack_charts(charts, resolution=128, texels_per_unit=share * largest)
+        assert packing.texels_per_unit == pytest.approx(share * largest)
+        check(charts, packing, [128, 128], 4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bracket", "channel", "stairs"])
+def test_unwrap_chooses_the_same_charts_at_the_density_that_it_reports(name):
+    V, F = getattr(hard_models, name)()
+    largest = unwrap(V, F, resolution=256)
+    result = unwrap(V, F, resolution=256, texels_per_unit=0.9995 * largest.texels_per_unit)
+    np.testing.assert_array_equal(result.charts, largest.charts)
+
+
+@pytest.mark.parametrize("closely", range(5))
+def test_some_charts_are_placed_as_boxes(closely):
+    charts = [(uv * (1 + 0.1 * k), F) for k, (uv, F) in enumerate([surfaces.annulus(3), surfaces.grid(2, 2)] * 2)]
+    check(charts, pack_charts(charts, resolution=128, closely=closely), [128, 128], 4)
 
 
 @pytest.mark.slow

@@ -101,6 +101,10 @@ class Task:
         """Tile (f',) of each triangle of the cleaned mesh, with ``tile_by``."""
         return None if self.tile is None else self.tile[self.cleaned.triangles]
 
+    def find_textures(self) -> IntArray:
+        """Return the texture (f',) of each triangle of the cleaned mesh; see `chart.find_textures`."""
+        return find_textures(self.cleaned_tile, self.wanted.stack, self.rules.mirror, self.points, self.cleaned.F)
+
     @property
     def bound(self) -> float:
         """Bound on the stretch."""
@@ -199,10 +203,8 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
         straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, task.bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others, draft.strips = np.flatnonzero(rest), straight, strips
-    # Beside kept charts, it is unknown how long charts may be.
-    density = task.density if task.kept is None else None
-    divide = partial(divide_long_charts, wanted=wanted, size=task.size, density=density)
-    texture = find_textures(task.cleaned_tile, wanted.stack, rules.mirror, points, cleaned.F)
+    divide = partial(divide_long_charts, wanted=wanted, size=task.size, density=None)
+    texture = task.find_textures()
     textures = Textures(task.size, float(wanted.padding), wanted.tiles, wanted.rotate)
     charts = find_charts(
         points,
@@ -239,7 +241,11 @@ def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:
             packing = _pack(task, charts, closely=_PACKED_CLOSELY if found.ended else BITMAPS)
         except ValueError as error:
             if not found.ended:
-                raise
+                divided = _divide_for_density(task, charts)
+                if len(divided) == len(charts):
+                    raise
+                charts = divided
+                continue
             raise ValueError(f"the search for charts ended early: {error}, or more time, which gives fewer") from error
         task.report("certify")
         layout = join_charts(charts, packing, len(cleaned.F))
@@ -252,6 +258,16 @@ def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:
             return PlacedCharts(charts, packing, layout, certificate)
         scale = packing.texels_per_unit / max(task.size)
         charts = mend_charts(charts, layout, faulty, scale=scale, V=points, cost=rules.cost, bound=task.bound)
+
+
+def _divide_for_density(task: Task, charts: list[Chart]) -> list[Chart]:
+    """Divide charts that do not fit into the texture where they are long at the given density, if one is given."""
+    # Beside kept charts, it is unknown how long charts may be.
+    if task.density is None or task.kept is not None or task.rules.uv is not None:
+        return charts
+    wanted, size, density = task.wanted, task.size, task.density
+    texture = task.find_textures()
+    return divide_long_charts(charts, task.points, task.rules.cost, texture, wanted=wanted, size=size, density=density)
 
 
 def _pack(task: Task, charts: list[Chart], *, closely: int) -> Packing:
