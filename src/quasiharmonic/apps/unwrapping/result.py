@@ -48,7 +48,9 @@ class UnwrapStatus(Enum):
     UNWRAPPED = "Every chart is bijective and no two charts overlap, verified exactly. The stretch is within the bound."
     STRETCHED = (
         "Every chart is bijective and no two charts overlap, verified exactly. Some charts are stretched by more "
-        "than the bound: see misses. They need more seams: permit more charts with max_charts, or a larger max_stretch."
+        "than the bound: see misses. They need more seams: permit more charts with max_charts, or a larger "
+        "max_stretch. In a lightmap, the sides of charts become whole texels, at least two: use a higher resolution or "
+        "density."
     )
     TIME_LIMIT = (
         "Every chart is bijective and no two charts overlap, verified exactly. The time limit ended the search for few "

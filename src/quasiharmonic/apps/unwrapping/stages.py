@@ -15,6 +15,7 @@ from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY, Textur
 from quasiharmonic.apps.atlas.packing.pack import Packing
 from quasiharmonic.apps.unwrapping.chart import Chart, find_textures, number_kinds
 from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, divide_long_charts, mend_charts
+from quasiharmonic.apps.unwrapping.chart_maps import THIN_ANGLE, WORST_STRETCH, smallest_angles
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
@@ -32,6 +33,7 @@ from quasiharmonic.apps.unwrapping.selection import KeptCharts, keep_charts, rea
 from quasiharmonic.apps.unwrapping.straightening import Strip, straighten_strips
 from quasiharmonic.apps.unwrapping.symmetry import check_symmetry
 from quasiharmonic.energies.measures import distortion
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.problem.run import run_until
 from quasiharmonic.targets.cuts.find import side_costs
 from quasiharmonic.util.arrays import (
@@ -52,6 +54,9 @@ _RESERVED = 2.0
 _PACKED_CLOSELY = MANY
 # Seconds in which a chart is packed, by its shape and as a box. At most this share of the limit is reserved for that.
 _SECONDS_BY_SHAPE, _SECONDS_AS_BOX, _MOST_RESERVED = 1.5e-2, 4e-4, 0.5
+
+# Rounding of texture coordinates stretches charts by less than this relative difference.
+_EQUAL_STRETCH = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,10 +308,13 @@ def collect(task: Task, found: FoundCharts, placed: PlacedCharts, began: float) 
     key, indices = np.unique(F * len(uv) + rows, return_inverse=True)
     vmapping, row = np.divmod(key, len(uv))
     stretch, area = _measure(task.points, cleaned, layout, size)
+    excess = [chart.misses for chart in charts]
+    if wanted.lightmap:
+        excess = _find_excess(task, charts, stretch, area)
     misses = [
-        Miss(k, _summarise(stretch[chart.triangles], area[chart.triangles]), chart.misses)
+        Miss(k, _summarise(stretch[chart.triangles], area[chart.triangles]), excess[k])
         for k, chart in enumerate(charts)
-        if chart.misses > 0 and not cleaned.widened[chart.triangles].all()
+        if excess[k] > 0 and not cleaned.widened[chart.triangles].all()
     ]
     misses.sort(key=lambda miss: -miss.excess)
     every = np.full(len(F), np.nan)
@@ -362,6 +370,24 @@ def _measure(
     measured = distortion(V, layout.rows, texels)
     flat = cleaned.widened
     return np.where(flat, np.nan, measured.isometric), np.where(flat, 0.0, measured.share)
+
+
+def _find_excess(task: Task, charts: list[Chart], stretch: FloatArray, area: FloatArray) -> list[float]:
+    """Return by how much each chart of a lightmap exceeds the bound, given the results of `_measure`.
+
+    Its sides are whole texels, at least two.
+    """
+    measured, most = ~np.isnan(stretch), (1 + _EQUAL_STRETCH) * task.bound
+    kept = not measured.any() or _summarise(stretch, area).p99 <= most
+    thin = smallest_angles(rest_shapes(task.points, task.cleaned.F).sides) < THIN_ANGLE
+    worst = np.where(measured & ~thin, stretch, 0.0)
+    found = []
+    for chart in charts:
+        rows = chart.triangles
+        p99 = task.bound if kept else _summarise(stretch[rows], area[rows]).p99
+        over = p99 - task.bound if p99 > most else 0.0
+        found.append(max(chart.misses, over, float(worst[rows].max()) - WORST_STRETCH))
+    return found
 
 
 def _summarise(stretch: FloatArray, area: FloatArray) -> Stretch:
