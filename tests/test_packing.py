@@ -231,6 +231,26 @@ def test_charts_without_area_and_with_inverted_triangles():
     check(charts[1:3], pack_charts(charts[1:3], resolution=256), (256, 256), 4)
 
 
+@pytest.mark.parametrize("rotate", [True, False])
+@pytest.mark.parametrize("place", [0.0, 3.0])
+def test_charts_without_extent(place, rotate):
+    points, F = surfaces.grid(2, 2)
+    (uv,) = pack_charts([(0 * points + place, F)], resolution=64, rotate=rotate).uv
+    assert ((uv >= 0) & (uv <= 1)).all()
+
+
+@pytest.mark.parametrize("scale", [1e308, 1e-305, 1e-310])
+@pytest.mark.parametrize("options", [{}, {"lightmap": True}, {"stack": True}])
+def test_models_of_extreme_size(scale, options):
+    V, F = hard_models.box(0.5, 0.5, 0.5)
+    wanted = unwrap(V, F, resolution=64, **options)
+    found = unwrap(V * scale, F, resolution=64, **options)
+    np.testing.assert_allclose(found.uvs, wanted.uvs, atol=1e-6)
+    expected = np.inf if scale == 1e-310 else wanted.texels_per_unit / scale
+    assert found.texels_per_unit == pytest.approx(expected)
+    assert (found.to_dict()["texels_per_unit"] is None) == np.isinf(expected)
+
+
 def test_nothing_to_pack():
     assert pack_charts([]).uv == ()
 

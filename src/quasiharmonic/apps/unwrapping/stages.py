@@ -319,6 +319,8 @@ def collect(task: Task, found: FoundCharts, placed: PlacedCharts, began: float) 
     misses.sort(key=lambda miss: -miss.excess)
     every = np.full(len(F), np.nan)
     every[cleaned.triangles] = stretch
+    with np.errstate(over="ignore"):
+        density = float(np.ldexp(packing.texels_per_unit, -task.exponent))
     return UnwrapResult(
         vmapping=vmapping,
         indices=indices.reshape(-1, 3),
@@ -333,7 +335,7 @@ def collect(task: Task, found: FoundCharts, placed: PlacedCharts, began: float) 
         cleaned=whole,
         status=find_status(certificate, misses, found.ended),
         resolution=size,
-        texels_per_unit=float(np.ldexp(packing.texels_per_unit, -task.exponent)),
+        texels_per_unit=density,
         V=task.V,
         kept_charts=np.arange(len(certificate.bijective_charts)) >= len(charts),
         strips=tuple(strip._replace(triangle=int(cleaned.triangles[strip.triangle])) for strip in found.strips),

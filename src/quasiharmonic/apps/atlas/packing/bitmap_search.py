@@ -230,6 +230,9 @@ class BitmapSearch:
         ``parts`` (n,) restricts the directions of each shape to one half, 1 or 2, or not, 0.
         """
         size, padding, most, _ = self._into
+        # Shapes without extent fit on every board.
+        if cells < 1:
+            return None
         texels = max(size) / cells
         columns, rows = count_cells(size, texels)
         if self._least_cells > most * columns * rows:

@@ -185,7 +185,8 @@ def _place_one(shape: Shape, into: Textures) -> Layout | None:
     def scales(angles: FloatArray) -> FloatArray:
         seen = np.exp(-1j * angles)[:, None] * shape.hull
         sides = np.stack([np.ptp(seen.real, axis=1), np.ptp(seen.imag, axis=1)], axis=1)
-        return np.asarray((room / np.maximum(sides, np.finfo(float).tiny)).min(axis=1))
+        with np.errstate(over="ignore"):
+            return np.asarray((room / np.maximum(sides, np.finfo(float).tiny)).min(axis=1))
 
     if room.min() <= 0:
         return None
