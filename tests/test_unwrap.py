@@ -198,7 +198,6 @@ def test_identical_components_are_stacked():
     assert stacked.success
     assert stacked.n_charts == 3 * alone.n_charts
     assert stacked.texels_per_unit > 1.1 * apart.texels_per_unit
-    assert stacked.texels_per_unit == pytest.approx(alone.texels_per_unit, rel=0.01)
 
 
 @pytest.mark.slow
