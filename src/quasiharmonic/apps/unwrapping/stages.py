@@ -201,6 +201,40 @@ def _find_time_left(task: Task, began: float) -> float | None:
 
 def _find_charts(task: Task, draft: Draft) -> list[Chart]:
     """Return the charts of a model that keep the bound, and fit into the texture. ``draft`` has those so far."""
+    charts, density = _search(task, draft, None), task.density
+    # Beside kept charts, it is unknown how long charts may be.
+    if density is None or task.kept is not None or task.rules.uv is not None:
+        return charts
+    divided = _divide(task, charts, density)
+    if len(divided) == len(charts) or _fit(task, charts):
+        return charts
+    return divided if _fit(task, divided) else _search(task, draft, density)
+
+
+def _divide(task: Task, charts: list[Chart], density: float | None) -> list[Chart]:
+    """Divide charts that are too long for the texture, at the density if one is given."""
+    return divide_long_charts(
+        charts,
+        task.points,
+        task.rules.cost,
+        task.find_textures(),
+        wanted=task.wanted,
+        size=task.size,
+        density=density,
+    )
+
+
+def _fit(task: Task, charts: list[Chart]) -> bool:
+    """Whether charts fit into the texture."""
+    try:
+        _pack(task, charts, closely=BITMAPS)
+    except ValueError:
+        return False
+    return True
+
+
+def _search(task: Task, draft: Draft, density: float | None) -> list[Chart]:
+    """Return charts that are not too long for the texture, at the density if one is given; see `_find_charts`."""
     points, cleaned, rules, wanted = task.points, task.cleaned, task.rules, task.wanted
     most = wanted.max_charts
     straight, strips = list[Chart](), list[Strip]()
@@ -208,7 +242,7 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
         straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, task.bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others, draft.strips = np.flatnonzero(rest), straight, strips
-    divide = partial(divide_long_charts, wanted=wanted, size=task.size, density=None)
+    divide = partial(divide_long_charts, wanted=wanted, size=task.size, density=density)
     texture = task.find_textures()
     textures = Textures(task.size, float(wanted.padding), wanted.tiles, wanted.rotate)
     charts = find_charts(
@@ -230,7 +264,7 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
         charts = [*straight, *(replace(chart, triangles=np.flatnonzero(rest)[chart.triangles]) for chart in charts)]
     if rules.uv is not None:
         return sorted(charts, key=lambda chart: int(chart.triangles[0]))
-    return divide(charts, points, rules.cost, texture)
+    return _divide(task, charts, density)
 
 
 def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:
@@ -246,11 +280,7 @@ def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:
             packing = _pack(task, charts, closely=_PACKED_CLOSELY if found.ended else BITMAPS)
         except ValueError as error:
             if not found.ended:
-                divided = _divide_for_density(task, charts)
-                if len(divided) == len(charts):
-                    raise
-                charts = divided
-                continue
+                raise
             raise ValueError(f"the search for charts ended early: {error}, or more time, which gives fewer") from error
         task.report("certify")
         layout = join_charts(charts, packing, len(cleaned.F))
@@ -263,16 +293,6 @@ def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:
             return PlacedCharts(charts, packing, layout, certificate)
         scale = packing.texels_per_unit / max(task.size)
         charts = mend_charts(charts, layout, faulty, scale=scale, V=points, cost=rules.cost, bound=task.bound)
-
-
-def _divide_for_density(task: Task, charts: list[Chart]) -> list[Chart]:
-    """Divide charts that do not fit into the texture where they are long at the given density, if one is given."""
-    # Beside kept charts, it is unknown how long charts may be.
-    if task.density is None or task.kept is not None or task.rules.uv is not None:
-        return charts
-    wanted, size, density = task.wanted, task.size, task.density
-    texture = task.find_textures()
-    return divide_long_charts(charts, task.points, task.rules.cost, texture, wanted=wanted, size=size, density=density)
 
 
 def _pack(task: Task, charts: list[Chart], *, closely: int) -> Packing:
