@@ -108,6 +108,16 @@ def test_charts_are_at_least_two_texels_wide():
     assert np.ptp(part.uvs * 64, axis=0).min() == 2
 
 
+def test_charts_that_whole_texels_stretch_beyond_the_bound_are_reported():
+    result = unwrap(*ROOM, lightmap=True, resolution=64, texels_per_unit=1, max_stretch=1.2)
+    assert result.status.name == "STRETCHED"
+    assert result.stretch.p99 > 1.2
+    assert max(miss.excess for miss in result.misses) == pytest.approx(result.stretch.p99 - 1.2)
+    assert "use a higher resolution" in result.message
+    finer = unwrap(*ROOM, lightmap=True, resolution=64, max_stretch=1.2)
+    assert (finer.status.name, finer.misses) == ("UNWRAPPED", ())
+
+
 def test_instances_have_places_of_their_own():
     result = unwrap([ROOM, ROOM], lightmap=True, resolution=128)
     assert not {*result.parts[0].charts} & {*result.parts[1].charts}

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+import hard_models
 from quasiharmonic import is_injective, surfaces, unwrap
 from quasiharmonic.apps.atlas.packing import bitmap_search
 from quasiharmonic.apps.atlas.packing.shapes import convex_hull
@@ -157,6 +158,33 @@ def test_a_given_density_is_kept():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2, 12, 60])
+def test_a_density_that_was_found_is_accepted(count):
+    charts = [surfaces.annulus(3 + k % 2) if k % 3 else surfaces.grid(2, 2) for k in range(count)]
+    charts = [(uv * [1, 0.4 + 0.05 * (k % 7)], F) for k, (uv, F) in enumerate(charts)]
+    largest = pack_charts(charts, resolution=128).texels_per_unit
+    for share in (1, 0.9995, 0.99, 0.97):
+        packing = pack_charts(charts, resolution=128, texels_per_unit=share * largest)
+        assert packing.texels_per_unit == pytest.approx(share * largest)
+        check(charts, packing, [128, 128], 4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bracket", "channel", "stairs"])
+def test_unwrap_chooses_the_same_charts_at_the_density_that_it_reports(name):
+    V, F = getattr(hard_models, name)()
+    largest = unwrap(V, F, resolution=256)
+    result = unwrap(V, F, resolution=256, texels_per_unit=0.9995 * largest.texels_per_unit)
+    np.testing.assert_array_equal(result.charts, largest.charts)
+
+
+@pytest.mark.parametrize("closely", range(5))
+def test_some_charts_are_placed_as_boxes(closely):
+    charts = [(uv * (1 + 0.1 * k), F) for k, (uv, F) in enumerate([surfaces.annulus(3), surfaces.grid(2, 2)] * 2)]
+    check(charts, pack_charts(charts, resolution=128, closely=closely), [128, 128], 4)
+
+
+@pytest.mark.slow
 def test_several_tiles():
     charts = grids(12)
     packing = pack_charts(charts, resolution=256, tiles=12)
@@ -201,6 +229,26 @@ def test_charts_without_area_and_with_inverted_triangles():
     check(charts, packing, (256, 256), 4)
     assert is_injective(F, packing.uv[0])
     check(charts[1:3], pack_charts(charts[1:3], resolution=256), (256, 256), 4)
+
+
+@pytest.mark.parametrize("rotate", [True, False])
+@pytest.mark.parametrize("place", [0.0, 3.0])
+def test_charts_without_extent(place, rotate):
+    points, F = surfaces.grid(2, 2)
+    (uv,) = pack_charts([(0 * points + place, F)], rotate=rotate).uv
+    assert ((uv >= 0) & (uv <= 1)).all()
+
+
+@pytest.mark.parametrize("scale", [1e308, 1e-305, 1e-310])
+@pytest.mark.parametrize("options", [{}, {"lightmap": True}, {"stack": True}])
+def test_models_of_extreme_size(scale, options):
+    V, F = hard_models.box(0.5, 0.5, 0.5)
+    wanted = unwrap(V, F, resolution=64, **options)
+    found = unwrap(V * scale, F, resolution=64, **options)
+    np.testing.assert_allclose(found.uvs, wanted.uvs, atol=1e-6)
+    expected = np.inf if scale == 1e-310 else wanted.texels_per_unit / scale
+    assert found.texels_per_unit == pytest.approx(expected)
+    assert (found.to_dict()["texels_per_unit"] is None) == np.isinf(expected)
 
 
 def test_nothing_to_pack():

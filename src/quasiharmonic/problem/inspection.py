@@ -329,7 +329,9 @@ def _volumes(V: FloatArray, F: IntArray, part: IntArray, count: int) -> FloatArr
     """Return six times the signed volume of each component, in an arbitrary unit; zeros for a planar mesh."""
     if V.shape[1] == 2:
         return np.zeros(count)
-    points = V - V.mean(axis=0)
+    # In this unit, sums do not overflow.
+    points = scale_to_unit(V)
+    points = points - points.mean(axis=0)
     points = points / max(float(np.abs(points).max()), np.finfo(float).tiny)
     a, b, c = (points[F[:, k]] for k in range(3))
     return np.bincount(part, (a * np.cross(b, c)).sum(axis=1), minlength=count).astype(np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -152,6 +153,22 @@ def _number_copies(charts: list[Chart], V: FloatArray, F: IntArray) -> list[int]
     Components count as congruent if they have equal numbers of triangles, areas, and moments. Congruent charts of one
     component have different numbers.
     """
+    label, kinds = _number_components(V, F)
+    # Of congruent charts of a component, the k-th is stacked with the k-th of other components.
+    same = find_copies([(chart.uv, chart.F) for chart in charts])
+    ranks, numbers = Counter[tuple[int, int]](), dict[tuple[int, int, int], int]()
+    found = []
+    for k, chart in enumerate(charts):
+        component = int(label[chart.triangles[0]])
+        shape = same[k].original if k in same else k
+        key = kinds[component], shape, ranks[component, shape]
+        ranks[component, shape] += 1
+        found.append(numbers.setdefault(key, len(numbers)))
+    return found
+
+
+def _number_components(V: FloatArray, F: IntArray) -> tuple[IntArray, dict[int, int]]:
+    """Return the component (f,) of each triangle, and the first congruent component for each one; see above."""
     label = components(F, len(V))[F[:, 0]]
     # In this unit, products neither overflow nor underflow.
     V = scale_to_unit(V)
@@ -169,17 +186,29 @@ def _number_copies(charts: list[Chart], V: FloatArray, F: IntArray) -> list[int]
         kinds[component] = next(same_kind, component)
         if kinds[component] == component:
             alike.append((component, measures))
-    # Of congruent charts of a component, the k-th is stacked with the k-th of other components.
-    same = find_copies([(chart.uv, chart.F) for chart in charts])
-    ranks, numbers = Counter[tuple[int, int]](), dict[tuple[int, int, int], int]()
-    found = []
-    for k, chart in enumerate(charts):
-        component = int(label[chart.triangles[0]])
-        shape = same[k].original if k in same else k
-        key = kinds[component], shape, ranks[component, shape]
-        ranks[component, shape] += 1
-        found.append(numbers.setdefault(key, len(numbers)))
-    return found
+    return label, kinds
+
+
+def find_textures(
+    tile: IntArray | None, stack: bool | str, mirror: Mirror | None, V: FloatArray, F: IntArray
+) -> IntArray:
+    """Return the texture (f,) of each triangle: its ``tile`` if given, 0 without; -1 if it is stacked on another."""
+    if tile is not None or not stack:
+        return np.zeros(len(F), dtype=np.int64) if tile is None else tile
+    if stack == "mirrored":
+        copies = np.zeros(len(F), dtype=np.bool_) if mirror is None else mirror.positive[mirror.triangle]
+    else:
+        label, kinds = _number_components(V, F)
+        copies = np.array([kinds[component] != component for component in label.tolist()], dtype=np.bool_)
+    return np.where(copies, -1, 0)
+
+
+def group_charts(charts: Sequence[Chart], texture: IntArray) -> list[list[Chart]]:
+    """Return the charts of each texture without copies, given the result (f,) of `find_textures`."""
+    groups = defaultdict[int, list[Chart]](list)
+    for chart in charts:
+        groups[int(texture[chart.triangles].max())].append(chart)
+    return [group for k, group in sorted(groups.items()) if k >= 0]
 
 
 def _mirror(F: IntArray, chart: Chart, mirror: Mirror) -> Chart:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.chart import Chart, halve
+from quasiharmonic.apps.unwrapping.chart import Chart, group_charts, halve
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, divide_overlap, group_undivided, is_undivided
 from quasiharmonic.apps.unwrapping.chart_maps import WORST_STRETCH
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
@@ -63,6 +63,7 @@ def divide_long_charts(
     charts: Sequence[Chart],
     V: FloatArray,
     cost: FloatArray,
+    texture: IntArray,
     *,
     wanted: UnwrapOptions,
     size: tuple[int, int],
@@ -79,6 +80,8 @@ def divide_long_charts(
         Vertices of the mesh.
     cost : (f, 3) float64
         Factors on the cost of seams; see `find_charts`.
+    texture : (f,) int64
+        See `find_textures`.
     wanted : UnwrapOptions
         With ``divide_for_packing``, charts without stretch and rectangles are divided like the others, and not only
         where they are too long.
@@ -93,7 +96,8 @@ def divide_long_charts(
         Ordered by first triangle.
     """
     for_packing = wanted.divide_for_packing
-    area = sum(chart.shape.area for chart in charts)
+    areas = [sum(chart.shape.area for chart in group) for group in group_charts(charts, texture)]
+    area = max(areas, default=0.0)
     ratio = max(size) / min(size)
     side = float(np.sqrt(area * ratio / (_TUNING.expected_use * wanted.tiles)))
     longest_flat = _TUNING.longest_flat * side

@@ -185,7 +185,13 @@ def _develop(
         return mask, charts
     own_mirror = None if mirror is None else mirror.select(rows)
     developed, more = develop_charts(
-        V, F[rows], cost[rows], choose, workers.check_wanted, own_mirror, max_stretch=max_stretch
+        V,
+        F[rows],
+        cost[rows],
+        None if choose is None else choose.select(rows),
+        workers.check_wanted,
+        own_mirror,
+        max_stretch=max_stretch,
     )
     left = np.inf if max_charts is None else max_charts - len(charts) - len(more)
     if int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1 <= left:

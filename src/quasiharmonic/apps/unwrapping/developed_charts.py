@@ -16,7 +16,7 @@ import numpy as np
 from quasiharmonic.apps.atlas.packing.shapes import convex_hull, find_smallest_box
 from quasiharmonic.apps.unwrapping.chart import Chart, cut_out_chart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, ahead, find_hinges
-from quasiharmonic.apps.unwrapping.layout import MAX_COMPARED, LayoutChoice
+from quasiharmonic.apps.unwrapping.layout import LayoutChoice
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import SAME, meet
@@ -26,8 +26,8 @@ from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops, group_by_label
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_points
 
-# Rounds with a larger loss than this are left out if there are more charts than `MAX_COMPARED`: the choice between
-# lists of charts would not notice that the union of two charts uses the texture worse.
+# Rounds with a larger loss than this are left out if there are too many charts to compare: the choice between lists of
+# charts would not notice that the union of two charts uses the texture worse.
 _SMALL_LOSS = 0.02
 # Share of the texture that charts are expected to cover.
 _EXPECTED = 0.7
@@ -99,7 +99,8 @@ def develop_charts(
     pieces = find_pieces(V, F, hinges, cost, mirror, max_stretch=max_stretch)
     if not pieces.count:
         return pieces.label >= 0, []
-    area, weight = surface_area(V, F), hinges.price(cost)
+    area = surface_area(V, F) if choose is None else choose.measure_area(V, F)
+    weight = hinges.price(cost)
     model = PaperModel(F, hinges, pieces, area, ~demanded, mirror)
     together = hinges.touch(cost >= UNDIVIDED_COST)
     kept = hinges.touch(cost >= KEPT_COST)
@@ -116,7 +117,7 @@ def develop_charts(
             return pieces.label >= 0, []
     found = [model.list_charts()]
     for longest, loss in _ROUNDS:
-        if loss > _SMALL_LOSS and (len(found[-1]) > MAX_COMPARED or (choose is not None and not choose.generous)):
+        if loss > _SMALL_LOSS and choose is not None and not choose.is_generous(found[-1]):
             break
         model.join(weight, together, longest, loss, check_wanted)
         found.append(model.list_charts())

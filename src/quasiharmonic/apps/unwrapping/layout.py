@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import Textures
 from quasiharmonic.apps.atlas.packing.layout import estimate_use
 from quasiharmonic.apps.atlas.packing.pack import Packing
-from quasiharmonic.apps.unwrapping.chart import Chart
+from quasiharmonic.apps.unwrapping.chart import Chart, group_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
+from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.topology import edge_keys
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 from quasiharmonic.util.progress import heartbeat
@@ -22,8 +23,8 @@ _GENEROUS = 0.05
 _MOSTLY_STRAIGHT = 0.87
 # Their share may be smaller by this difference.
 _BENT = 0.03
-#: Lists with more charts than this are not packed for comparison.
-MAX_COMPARED = 150
+# Lists with more charts than this are not packed for comparison.
+_MAX_COMPARED = 150
 # A layout that uses this share of the texture is good enough: no further list is compared.
 _GOOD_USE = 0.83
 #: Positions in the unit square are multiples of this unit. Single precision stores these numbers and their differences
@@ -71,20 +72,31 @@ class LayoutChoice:
     Attributes
     ----------
     divide : callable
-        Divides long charts, given positions (n, 3) and costs (f, 3) of the surface.
+        Divides long charts, given positions (n, 3), costs (f, 3) and textures (f,) of the surface.
     into : Textures
     loss : float
         By which the use of the texture may be below the best one for the sake of fewer charts.
+    texture : (f,) int64
+        See `find_textures`.
     """
 
-    divide: Callable[[list[Chart], FloatArray, FloatArray], list[Chart]]
+    divide: Callable[[list[Chart], FloatArray, FloatArray, IntArray], list[Chart]]
     into: Textures
     loss: float
+    texture: IntArray
 
-    @property
-    def generous(self) -> bool:
-        """Whether unions with much larger boxes than their parts can be worth their use of the texture."""
-        return self.loss > _GENEROUS
+    def select(self, rows: IntArray) -> LayoutChoice:
+        """Return the choice for some triangles (k,)."""
+        return replace(self, texture=self.texture[rows])
+
+    def measure_area(self, V: FloatArray, F: IntArray) -> float:
+        """Return the largest area of the triangles of a texture, given positions (n, 3) and all triangles (f, 3)."""
+        numbers = np.unique(self.texture[self.texture >= 0]).tolist()
+        return max((surface_area(V, F[self.texture == k]) for k in numbers), default=surface_area(V, F))
+
+    def is_generous(self, charts: list[Chart]) -> bool:
+        """Whether unions of charts with much larger boxes than their parts can be worth their use of the texture."""
+        return self.loss > _GENEROUS and self._are_comparable(group_charts(charts, self.texture))
 
     def choose(self, found: list[list[Chart]], V: FloatArray, cost: FloatArray) -> list[Chart]:
         """Return the last list that uses the texture at most by `loss` worse than the best one, long charts divided.
@@ -98,19 +110,33 @@ class LayoutChoice:
             allowed = straight >= (straight.max() - _BENT if straight.max() >= _MOSTLY_STRAIGHT else 0.0)
             lists = [lists[k] for k in np.flatnonzero(allowed)[::-1]]
         if len(lists) == 1:
-            return self.divide(lists[0], V, cost)
+            return self.divide(lists[0], V, cost, self.texture)
         chosen, use = lists[0], -1.0
         for some in lists:
-            charts = self.divide(some, V, cost)
-            covered = 0.0
-            if len(charts) <= MAX_COMPARED:
-                shapes, above = [chart.shape for chart in charts], max(use + self.loss, 0.0)
-                covered = estimate_use(shapes, self.into, above=above)
+            charts = self.divide(some, V, cost, self.texture)
+            covered = self._estimate_use(charts, max(use + self.loss, 0.0))
             if use < 0 or covered > use + self.loss:
                 chosen, use = charts, covered
             if use >= _GOOD_USE - self.loss:
                 break
         return chosen
+
+    def _estimate_use(self, charts: list[Chart], above: float) -> float:
+        """Part of the fullest texture that charts cover at one scale; 0 if that is not above a given part."""
+        groups = group_charts(charts, self.texture)
+        if not self._are_comparable(groups):
+            return 0.0
+        areas = [sum(chart.shape.area for chart in group) for group in groups]
+        uses = []
+        for group, area in zip(groups, areas, strict=True):
+            if area > 0:
+                share = area / max(areas)
+                uses.append(estimate_use([chart.shape for chart in group], self.into, above=above * share) / share)
+        return min(uses, default=0.0)
+
+    def _are_comparable(self, groups: list[list[Chart]]) -> bool:
+        """Whether the charts of all textures are few enough to pack them for comparison."""
+        return max(map(len, groups), default=0) <= _MAX_COMPARED
 
 
 def _straight_share(charts: list[Chart]) -> float:

@@ -47,6 +47,8 @@ class PlacingTuning(NamedTuple):
     lower_scale: float = 0.8
     scale_trials: int = 60
     bisections: int = 7
+    # Charts are packed in units of at most this power of two, and at least its inverse.
+    largest_exponent: int = 1000
 
 
 _TUNING = PlacingTuning()
@@ -101,11 +103,12 @@ def place_charts(
     padding = float(wanted.padding)
     if wanted.lightmap:
         return _pack_texel_boxes(charts, size, padding, wanted.rotate, density)
+    exponent = min(max(exponent, -_TUNING.largest_exponent), _TUNING.largest_exponent)
     if tile is not None:
         options["rounding"] = _TUNING.rounding
 
     def pack(some: Sequence[Chart], density: float | None) -> Packing:
-        # In the model's own unit, so that messages have its density.
+        # In the model's own unit, so that messages have its density, or in the next one that is far from overflow.
         packing = pack_charts(
             [(np.ldexp(chart.uv, exponent), chart.F) for chart in some],
             resolution=size,

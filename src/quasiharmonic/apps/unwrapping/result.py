@@ -48,7 +48,9 @@ class UnwrapStatus(Enum):
     UNWRAPPED = "Every chart is bijective and no two charts overlap, verified exactly. The stretch is within the bound."
     STRETCHED = (
         "Every chart is bijective and no two charts overlap, verified exactly. Some charts are stretched by more "
-        "than the bound: see misses. They need more seams: permit more charts with max_charts, or a larger max_stretch."
+        "than the bound: see misses. They need more seams: permit more charts with max_charts, or a larger "
+        "max_stretch. In a lightmap, the sides of charts become whole texels, at least two: use a higher resolution or "
+        "density."
     )
     TIME_LIMIT = (
         "Every chart is bijective and no two charts overlap, verified exactly. The time limit ended the search for few "
@@ -191,7 +193,8 @@ class UnwrapResult(Outcome, Displayable):
     resolution : (int, int)
         Width and height of the texture in texels.
     texels_per_unit : float
-        Texels per unit of length of the model, in new charts.
+        Texels per unit of length of the model, in new charts; infinite if double precision has no such number, for
+        models smaller than about 1e-305.
     kept_charts : (c,) bool
         Charts whose texture coordinates were kept; see ``faces``.
     V : (n, 2) or (n, 3) float64
@@ -269,7 +272,8 @@ class UnwrapResult(Outcome, Displayable):
         # In this unit, squares neither overflow nor underflow.
         exponent = find_exponent(self.V)
         ends = np.ldexp(self.V[self.seams], -exponent)
-        return float(np.ldexp(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum(), exponent))
+        with np.errstate(over="ignore"):
+            return float(np.ldexp(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum(), exponent))
 
     def inverse(self) -> ChartInverse:
         """Return the inverse map, from the texture to the model, for points, triangles and values of the model.
@@ -344,10 +348,11 @@ class UnwrapResult(Outcome, Displayable):
             "charts": self.n_charts,
             "kept_charts": int(self.kept_charts.sum()),
             "seam_edges": len(self.seams),
-            "seam_length": self.seam_length,
+            "seam_length": _replace_infinite(self.seam_length),
             "stretch": _finite(self.stretch),
             "misses": [miss._asdict() | {"stretch": _finite(miss.stretch)} for miss in self.misses],
-            **as_plain(self, "utilisation", "texels_per_unit"),
+            **as_plain(self, "utilisation"),
+            "texels_per_unit": _replace_infinite(self.texels_per_unit),
             "resolution": list(self.resolution),
             "strips": [strip._asdict() for strip in self.strips],
             "symmetry": self.symmetry._asdict(),
@@ -371,4 +376,9 @@ def _describe_strips(strips: tuple[Strip, ...]) -> str:
 
 def _finite(stretch: Stretch) -> dict[str, float | None]:
     """Return a stretch for JSON, which has neither infinity nor NaN."""
-    return {key: value if np.isfinite(value) else None for key, value in stretch._asdict().items()}
+    return {key: _replace_infinite(value) for key, value in stretch._asdict().items()}
+
+
+def _replace_infinite(value: float) -> float | None:
+    """Return a number for JSON: None if it is infinite or NaN."""
+    return value if np.isfinite(value) else None

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY, Textures
 from quasiharmonic.apps.atlas.packing.pack import Packing
-from quasiharmonic.apps.unwrapping.chart import Chart, number_kinds
+from quasiharmonic.apps.unwrapping.chart import Chart, find_textures, number_kinds
 from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, divide_long_charts, mend_charts
+from quasiharmonic.apps.unwrapping.chart_maps import THIN_ANGLE, WORST_STRETCH, smallest_angles
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certify_charts
 from quasiharmonic.apps.unwrapping.charts import find_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
@@ -32,6 +33,7 @@ from quasiharmonic.apps.unwrapping.selection import KeptCharts, keep_charts, rea
 from quasiharmonic.apps.unwrapping.straightening import Strip, straighten_strips
 from quasiharmonic.apps.unwrapping.symmetry import check_symmetry
 from quasiharmonic.energies.measures import distortion
+from quasiharmonic.geometry.mesh.reference import rest_shapes
 from quasiharmonic.problem.run import run_until
 from quasiharmonic.targets.cuts.find import side_costs
 from quasiharmonic.util.arrays import (
@@ -52,6 +54,9 @@ _RESERVED = 2.0
 _PACKED_CLOSELY = MANY
 # Seconds in which a chart is packed, by its shape and as a box. At most this share of the limit is reserved for that.
 _SECONDS_BY_SHAPE, _SECONDS_AS_BOX, _MOST_RESERVED = 1.5e-2, 4e-4, 0.5
+
+# Rounding of texture coordinates stretches charts by less than this relative difference.
+_EQUAL_STRETCH = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +100,15 @@ class Task:
     points: FloatArray
     rules: Rules
     density: float | None
+
+    @property
+    def cleaned_tile(self) -> IntArray | None:
+        """Tile (f',) of each triangle of the cleaned mesh, with ``tile_by``."""
+        return None if self.tile is None else self.tile[self.cleaned.triangles]
+
+    def find_textures(self) -> IntArray:
+        """Return the texture (f',) of each triangle of the cleaned mesh; see `chart.find_textures`."""
+        return find_textures(self.cleaned_tile, self.wanted.stack, self.rules.mirror, self.points, self.cleaned.F)
 
     @property
     def bound(self) -> float:
@@ -187,6 +201,40 @@ def _find_time_left(task: Task, began: float) -> float | None:
 
 def _find_charts(task: Task, draft: Draft) -> list[Chart]:
     """Return the charts of a model that keep the bound, and fit into the texture. ``draft`` has those so far."""
+    charts, density = _search(task, draft, None), task.density
+    # Beside kept charts, it is unknown how long charts may be.
+    if density is None or task.kept is not None or task.rules.uv is not None:
+        return charts
+    divided = _divide(task, charts, density)
+    if len(divided) == len(charts) or _fit(task, charts):
+        return charts
+    return divided if _fit(task, divided) else _search(task, draft, density)
+
+
+def _divide(task: Task, charts: list[Chart], density: float | None) -> list[Chart]:
+    """Divide charts that are too long for the texture, at the density if one is given."""
+    return divide_long_charts(
+        charts,
+        task.points,
+        task.rules.cost,
+        task.find_textures(),
+        wanted=task.wanted,
+        size=task.size,
+        density=density,
+    )
+
+
+def _fit(task: Task, charts: list[Chart]) -> bool:
+    """Whether charts fit into the texture."""
+    try:
+        _pack(task, charts, closely=BITMAPS)
+    except ValueError:
+        return False
+    return True
+
+
+def _search(task: Task, draft: Draft, density: float | None) -> list[Chart]:
+    """Return charts that are not too long for the texture, at the density if one is given; see `_find_charts`."""
     points, cleaned, rules, wanted = task.points, task.cleaned, task.rules, task.wanted
     most = wanted.max_charts
     straight, strips = list[Chart](), list[Strip]()
@@ -194,9 +242,8 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
         straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, task.bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others, draft.strips = np.flatnonzero(rest), straight, strips
-    # Beside kept charts, it is unknown how long charts may be.
-    density = task.density if task.kept is None else None
     divide = partial(divide_long_charts, wanted=wanted, size=task.size, density=density)
+    texture = task.find_textures()
     textures = Textures(task.size, float(wanted.padding), wanted.tiles, wanted.rotate)
     charts = find_charts(
         points,
@@ -208,7 +255,7 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
         uv=None if rules.uv is None else rules.uv[rest],
         mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
         draft=draft,
-        choose=LayoutChoice(divide, textures, float(wanted.packing_loss)),
+        choose=LayoutChoice(divide, textures, float(wanted.packing_loss), texture[rest]),
         callback=task.report,
         jobs=wanted.jobs,
     )
@@ -217,7 +264,7 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
         charts = [*straight, *(replace(chart, triangles=np.flatnonzero(rest)[chart.triangles]) for chart in charts)]
     if rules.uv is not None:
         return sorted(charts, key=lambda chart: int(chart.triangles[0]))
-    return divide(charts, points, rules.cost)
+    return _divide(task, charts, density)
 
 
 def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:
@@ -253,7 +300,7 @@ def _pack(task: Task, charts: list[Chart], *, closely: int) -> Packing:
     kept = task.kept
     return place_charts(
         charts,
-        None if task.tile is None else task.tile[task.cleaned.triangles],
+        task.cleaned_tile,
         task.wanted,
         task.size,
         task.density,
@@ -281,14 +328,19 @@ def collect(task: Task, found: FoundCharts, placed: PlacedCharts, began: float) 
     key, indices = np.unique(F * len(uv) + rows, return_inverse=True)
     vmapping, row = np.divmod(key, len(uv))
     stretch, area = _measure(task.points, cleaned, layout, size)
+    excess = [chart.misses for chart in charts]
+    if wanted.lightmap:
+        excess = _find_excess(task, charts, stretch, area)
     misses = [
-        Miss(k, _summarise(stretch[chart.triangles], area[chart.triangles]), chart.misses)
+        Miss(k, _summarise(stretch[chart.triangles], area[chart.triangles]), excess[k])
         for k, chart in enumerate(charts)
-        if chart.misses > 0 and not cleaned.widened[chart.triangles].all()
+        if excess[k] > 0 and not cleaned.widened[chart.triangles].all()
     ]
     misses.sort(key=lambda miss: -miss.excess)
     every = np.full(len(F), np.nan)
     every[cleaned.triangles] = stretch
+    with np.errstate(over="ignore"):
+        density = float(np.ldexp(packing.texels_per_unit, -task.exponent))
     return UnwrapResult(
         vmapping=vmapping,
         indices=indices.reshape(-1, 3),
@@ -303,7 +355,7 @@ def collect(task: Task, found: FoundCharts, placed: PlacedCharts, began: float) 
         cleaned=whole,
         status=find_status(certificate, misses, found.ended),
         resolution=size,
-        texels_per_unit=float(np.ldexp(packing.texels_per_unit, -task.exponent)),
+        texels_per_unit=density,
         V=task.V,
         kept_charts=np.arange(len(certificate.bijective_charts)) >= len(charts),
         strips=tuple(strip._replace(triangle=int(cleaned.triangles[strip.triangle])) for strip in found.strips),
@@ -340,6 +392,24 @@ def _measure(
     measured = distortion(V, layout.rows, texels)
     flat = cleaned.widened
     return np.where(flat, np.nan, measured.isometric), np.where(flat, 0.0, measured.share)
+
+
+def _find_excess(task: Task, charts: list[Chart], stretch: FloatArray, area: FloatArray) -> list[float]:
+    """Return by how much each chart of a lightmap exceeds the bound, given the results of `_measure`.
+
+    Its sides are whole texels, at least two.
+    """
+    measured, most = ~np.isnan(stretch), (1 + _EQUAL_STRETCH) * task.bound
+    kept = not measured.any() or _summarise(stretch, area).p99 <= most
+    thin = smallest_angles(rest_shapes(task.points, task.cleaned.F).sides) < THIN_ANGLE
+    worst = np.where(measured & ~thin, stretch, 0.0)
+    found = []
+    for chart in charts:
+        rows = chart.triangles
+        p99 = task.bound if kept else _summarise(stretch[rows], area[rows]).p99
+        over = p99 - task.bound if p99 > most else 0.0
+        found.append(max(chart.misses, over, float(worst[rows].max()) - WORST_STRETCH))
+    return found
 
 
 def _summarise(stretch: FloatArray, area: FloatArray) -> Stretch:

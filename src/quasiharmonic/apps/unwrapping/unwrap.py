@@ -96,7 +96,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
         texels, which changes their length by at most half a texel, and no chart is shorter than two texels. Edges of
         more than 60° are seams, unless ``hard_edges`` is given. Instances have places of their own. The padding is at
         least four texels; then no bilinear filter mixes charts, at the resolution or at half of it.
-        `UnwrapResult.stretch` includes the change of the lengths.
+        `UnwrapResult.stretch` and `UnwrapResult.misses` include the change of the lengths.
     rotate : bool
         Whether charts may be rotated to fit better.
     stack : bool or str

@@ -7,7 +7,7 @@ larger scale. So the search for the largest scale is a search for the smallest b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, pi, sqrt
 from typing import NamedTuple
 
@@ -91,12 +91,22 @@ class Layout:
     centres : (n,) complex128
         Centre of each rotated shape's box in its tile, in texels.
     tiles : (n,) int64
+    least : float
+        Smallest scale to which the layout can shrink about the centres of the tiles without less than the padding.
     """
 
     scale: float
     directions: ComplexArray
     centres: ComplexArray
     tiles: IntArray
+    least: float
+
+    def shrink(self, scale: float, size: tuple[int, int]) -> Layout | None:
+        """Return the layout at another scale, in tiles of a size; None if the scale is too large or too small."""
+        if not self.least <= scale <= self.scale:
+            return None
+        middle = complex(*size) / 2
+        return replace(self, scale=scale, centres=middle + (self.centres - middle) * (scale / self.scale))
 
 
 class BitmapSearch:
@@ -171,17 +181,19 @@ class BitmapSearch:
     def enlarge(self, least: float, trials: int) -> tuple[Layout, IntArray] | None:
         """Find a small board on which few bitmaps fit, at a larger scale than the least.
 
-        Return the layout on it, and the order of the shapes.
+        Return the layout on it, and the order of the shapes that are not placed as boxes.
         """
         best, high = self._scan(least, _TUNING.precision)
         if best is None:
             return None
         while (found := self.place_in(high - 1)) is not None:
             best, high = found, high - 1
-        generator, best_order = np.random.default_rng(0), self._order
+        drawn = self._order[: self._drawn]
+        generator, best_order = np.random.default_rng(0), drawn
         for _ in range(trials // len(self.areas)):
             factors = np.exp(generator.normal(0, _TUNING.spread, len(self.areas)))
             order = np.argsort(-self.areas * factors, kind="stable")
+            order = order[np.isin(order, drawn)]
             parts = generator.integers(0, 3, len(self.areas))
             while (found := self.place_in(high - 1, order, parts)) is not None:
                 high, best, best_order = high - 1, found, order
@@ -218,6 +230,9 @@ class BitmapSearch:
         ``parts`` (n,) restricts the directions of each shape to one half, 1 or 2, or not, 0.
         """
         size, padding, most, _ = self._into
+        # Shapes without extent fit on every board.
+        if cells < 1:
+            return None
         texels = max(size) / cells
         columns, rows = count_cells(size, texels)
         if self._least_cells > most * columns * rows:
@@ -227,7 +242,10 @@ class BitmapSearch:
             for tile in range(most):
                 boards.open().put(self._occupied.draw(tile, cells, self._radius), 0, 0)
         n = len(self.areas)
-        layout = Layout(texels / self._cell, np.empty(n, complex), np.empty(n, complex), np.empty(n, dtype=np.int64))
+        scale, tiles = texels / self._cell, np.empty(n, dtype=np.int64)
+        # Bitmaps have space for the padding on boards of so many cells, boxes on this board only.
+        least = scale if len(self._boxes) else max(size) / (MORE_CELLS * self.cells * self._cell)
+        layout = Layout(scale, np.empty(n, complex), np.empty(n, complex), tiles, least)
         drawn, boxes = self._order[: self._drawn] if order is None else order, self._order[self._drawn :]
         if not self._place_bitmaps(boards, layout, (cells,), drawn, parts):
             return None

@@ -76,15 +76,25 @@ def find_layout(
     if scale is not None:
         if not _may_fit(shapes, into, scale):
             return None
-        search = BitmapSearch(shapes, into, scale, bitmaps=bitmaps)
-        return search.place_in(search.cells)
+        if (quick := _place_at(shapes, into, scale, bitmaps)) is not None:
+            return quick
+        largest = find_layout(shapes, into, None, bitmaps=bitmaps)
+        return None if largest is None else largest.shrink(scale, into.size)
     layout, order = _enlarge(shapes, into, least_scale(shapes), TRIALS, bitmaps=bitmaps)
     if layout is None:
         return _place_boxes(shapes, into)
     if order is None:
         return layout
-    fine = BitmapSearch(shapes, into, layout.scale, given=layout.directions)
+    fine = BitmapSearch(shapes, into, layout.scale, given=layout.directions, bitmaps=bitmaps)
     return fine.enlarge_finely(order) or layout
+
+
+def _place_at(shapes: Sequence[Shape], into: Textures, scale: float, bitmaps: int = BITMAPS) -> Layout | None:
+    """Place shapes quickly at a given scale; None if they do not fit."""
+    if not _may_fit(shapes, into, scale):
+        return None
+    search = BitmapSearch(shapes, into, scale, bitmaps=bitmaps)
+    return search.place_in(search.cells)
 
 
 def _enlarge(
@@ -175,7 +185,8 @@ def _place_one(shape: Shape, into: Textures) -> Layout | None:
     def scales(angles: FloatArray) -> FloatArray:
         seen = np.exp(-1j * angles)[:, None] * shape.hull
         sides = np.stack([np.ptp(seen.real, axis=1), np.ptp(seen.imag, axis=1)], axis=1)
-        return np.asarray((room / np.maximum(sides, np.finfo(float).tiny)).min(axis=1))
+        with np.errstate(over="ignore"):
+            return np.asarray((room / np.maximum(sides, np.finfo(float).tiny)).min(axis=1))
 
     if room.min() <= 0:
         return None
@@ -193,9 +204,8 @@ def _place_one(shape: Shape, into: Textures) -> Layout | None:
         return None
     if not max(shape.extent(1)):
         scale = least
-    return Layout(
-        scale, np.exp(1j * np.array([best])), np.array([complex(*into.size) / 2]), np.zeros(1, dtype=np.int64)
-    )
+    centre, tile = np.array([complex(*into.size) / 2]), np.zeros(1, dtype=np.int64)
+    return Layout(scale, np.exp(1j * np.array([best])), centre, tile, 0.0)
 
 
 def find_sufficient_size(shapes: Sequence[Shape], into: Textures, scale: float | None) -> tuple[int, int]:
@@ -209,7 +219,7 @@ def find_sufficient_size(shapes: Sequence[Shape], into: Textures, scale: float |
 
     def fits(size: tuple[int, int]) -> bool:
         larger = into._replace(size=size)
-        found = _place_boxes(shapes, larger) if scale is None else find_layout(shapes, larger, scale)
+        found = _place_boxes(shapes, larger) if scale is None else _place_at(shapes, larger, scale)
         return found is not None
 
     low, high = 1.0, 2.0

@@ -84,7 +84,8 @@ class Packing:
     uv : tuple of (m, 2) float64
         Texture coordinates of each chart's vertices. Tile ``k`` is the unit square at ``(k % 10, k // 10)``.
     texels_per_unit : float
-        Scale of all charts: texels per unit of length of the given maps.
+        Scale of all charts: texels per unit of length of the given maps; infinite if double precision has no such
+        number, for maps smaller than about 1e-305.
     utilisation : float
         Area of the charts in texels, as a fraction of all tiles. Charts in the same place count once.
 
@@ -234,7 +235,8 @@ def pack_charts(
         for (points, _), placement in zip(pairs, placements, strict=True)
     )
     covered = sum(shape.area for shape in shapes) * layout.scale**2
-    density = float(np.ldexp(layout.scale, -exponent))
+    with np.errstate(over="ignore"):
+        density = float(np.ldexp(layout.scale, -exponent))
     return Packing(placements, uv, density, covered / into.texels)
 
 
