@@ -169,6 +169,13 @@ def test_a_density_that_was_found_is_accepted(count):
         check(charts, packing, [128, 128], 4)
 
 
+def test_a_density_at_which_the_area_exceeds_the_texture_is_refused_without_dividing_charts():
+    V, F = surfaces.cat(12)
+    count = unwrap(V, F, resolution=256).n_charts
+    with pytest.raises(ValueError, match=rf"^{count} charts .* not fit into 256 × 256 texels: resolution=\d+ suffices"):
+        unwrap(V, F, resolution=256, texels_per_unit=1e5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bracket", "channel", "stairs"])
 def test_unwrap_chooses_the_same_charts_at_the_density_that_it_reports(name):

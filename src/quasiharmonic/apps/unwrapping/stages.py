@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY, Textures
 from quasiharmonic.apps.atlas.packing.pack import Packing
-from quasiharmonic.apps.unwrapping.chart import Chart, find_textures, number_kinds
+from quasiharmonic.apps.unwrapping.chart import Chart, find_textures, group_charts, number_kinds
 from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, divide_long_charts, mend_charts
 from quasiharmonic.apps.unwrapping.chart_maps import THIN_ANGLE, WORST_STRETCH, smallest_angles
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certify_charts
@@ -111,6 +111,11 @@ class Task:
         return find_textures(self.cleaned_tile, self.wanted.stack, self.rules.mirror, self.points, self.cleaned.F)
 
     @property
+    def textures(self) -> Textures:
+        """The texture, or several, that the charts share, or each of those with ``tile_by``."""
+        return Textures(self.size, float(self.wanted.padding), self.wanted.tiles, self.wanted.rotate)
+
+    @property
     def bound(self) -> float:
         """Bound on the stretch."""
         return float(self.wanted.max_stretch)
@@ -205,6 +210,10 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
     # Beside kept charts, it is unknown how long charts may be.
     if density is None or task.kept is not None or task.rules.uv is not None:
         return charts
+    areas = [sum(chart.shape.area for chart in group) for group in group_charts(charts, task.find_textures())]
+    if max(areas, default=0.0) * density**2 > task.textures.texels:
+        # Shorter charts would not fit either.
+        return charts
     divided = _divide(task, charts, density)
     if len(divided) == len(charts) or _fit(task, charts):
         return charts
@@ -244,7 +253,6 @@ def _search(task: Task, draft: Draft, density: float | None) -> list[Chart]:
     draft.rows, draft.others, draft.strips = np.flatnonzero(rest), straight, strips
     divide = partial(divide_long_charts, wanted=wanted, size=task.size, density=density)
     texture = task.find_textures()
-    textures = Textures(task.size, float(wanted.padding), wanted.tiles, wanted.rotate)
     charts = find_charts(
         points,
         cleaned.F[rest],
@@ -255,7 +263,7 @@ def _search(task: Task, draft: Draft, density: float | None) -> list[Chart]:
         uv=None if rules.uv is None else rules.uv[rest],
         mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
         draft=draft,
-        choose=LayoutChoice(divide, textures, float(wanted.packing_loss), texture[rest]),
+        choose=LayoutChoice(divide, task.textures, float(wanted.packing_loss), texture[rest]),
         callback=task.report,
         jobs=wanted.jobs,
     )
