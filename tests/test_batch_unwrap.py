@@ -53,7 +53,7 @@ def write_archive(path, models):
 
 
 def read_archive(path):
-    """The maps in an archive of results, and the files beside them, by their names."""
+    """The maps in an archive of results, their libraries and images, by name."""
     found = {}
     for result in read_results(path):
         folder = result.key.rpartition("/")

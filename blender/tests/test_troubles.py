@@ -72,7 +72,7 @@ def test_linked_from_another_file(act, linked):
 
 
 @pytest.mark.parametrize("act", ALL)
-def test_selected_objects_of_another_file_are_left_out_and_told(act, linked, said):
+def test_selected_objects_of_another_file_are_left_out_and_reported(act, linked, said):
     before = scenes.places(linked)
     scenes.add_quads()
     linked.select_set(True)

@@ -28,7 +28,7 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 from quasiharmonic.util.hints import make_dataframe
-from quasiharmonic.util.outcome import Displayable
+from quasiharmonic.util.outcome import Displayable, replace_nonfinite
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,7 +85,7 @@ class Statistics:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the statistics for JSON, with None for values that are not finite."""
-        return {key: value if np.isfinite(value) else None for key, value in vars(self).items()}
+        return {key: replace_nonfinite(value) for key, value in vars(self).items()}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -247,7 +247,7 @@ class Distortion(Displayable):
             for name, values in self.per_triangle().items()
         }
         return {
-            "scale": self.scale if np.isfinite(self.scale) else None,
+            "scale": replace_nonfinite(self.scale),
             "flat": int(self.flat.size),
             "inverted": int(self.inverted.size),
             **summaries,

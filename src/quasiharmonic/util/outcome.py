@@ -7,6 +7,8 @@ first time.
 
 from __future__ import annotations
 
+from math import isfinite
+
 # Same effect as in `typing`, whose import would dominate the import time of the package.
 TYPE_CHECKING = False
 
@@ -31,6 +33,11 @@ def _make_plain(value: Any) -> Any:
         if hasattr(value, convert):
             return getattr(value, convert)()
     return value
+
+
+def replace_nonfinite(value: float) -> float | None:
+    """Return a number for JSON, which has neither infinity nor NaN: None for these."""
+    return value if isfinite(value) else None
 
 
 class Verdict:

@@ -211,6 +211,11 @@ def group_charts(charts: Sequence[Chart], texture: IntArray) -> list[list[Chart]
     return [group for k, group in sorted(groups.items()) if k >= 0]
 
 
+def measure_charts(charts: Sequence[Chart]) -> float:
+    """Return the area of charts in the plane."""
+    return sum(chart.shape.area for chart in charts)
+
+
 def _mirror(F: IntArray, chart: Chart, mirror: Mirror) -> Chart:
     """Return the mirror image of a chart."""
     rows = mirror.triangle[chart.triangles]

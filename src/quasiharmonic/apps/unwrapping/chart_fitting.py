@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.chart import Chart, group_charts, halve
+from quasiharmonic.apps.unwrapping.chart import Chart, group_charts, halve, measure_charts
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, divide_overlap, group_undivided, is_undivided
 from quasiharmonic.apps.unwrapping.chart_maps import WORST_STRETCH
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
@@ -96,8 +96,7 @@ def divide_long_charts(
         Ordered by first triangle.
     """
     for_packing = wanted.divide_for_packing
-    areas = [sum(chart.shape.area for chart in group) for group in group_charts(charts, texture)]
-    area = max(areas, default=0.0)
+    area = max(map(measure_charts, group_charts(charts, texture)), default=0.0)
     ratio = max(size) / min(size)
     side = float(np.sqrt(area * ratio / (_TUNING.expected_use * wanted.tiles)))
     longest_flat = _TUNING.longest_flat * side

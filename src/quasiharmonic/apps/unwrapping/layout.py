@@ -10,7 +10,7 @@ import numpy as np
 from quasiharmonic.apps.atlas.packing.bitmap_search import Textures
 from quasiharmonic.apps.atlas.packing.layout import estimate_use
 from quasiharmonic.apps.atlas.packing.pack import Packing
-from quasiharmonic.apps.unwrapping.chart import Chart, group_charts
+from quasiharmonic.apps.unwrapping.chart import Chart, group_charts, measure_charts
 from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh
 from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.topology import edge_keys
@@ -65,6 +65,10 @@ class ChartLayout:
         return np.where(self.mirrored[:, None], self.rows[:, ::-1], self.rows)
 
 
+#: Divides long charts, given positions (n, 3), costs (f, 3) and textures (f,) of the surface.
+Divide = Callable[[list[Chart], FloatArray, FloatArray, IntArray], list[Chart]]
+
+
 @dataclass(frozen=True, eq=False)
 class LayoutChoice:
     """How to choose from several lists of charts of the same triangles.
@@ -72,7 +76,7 @@ class LayoutChoice:
     Attributes
     ----------
     divide : callable
-        Divides long charts, given positions (n, 3), costs (f, 3) and textures (f,) of the surface.
+        See `Divide`.
     into : Textures
     loss : float
         By which the use of the texture may be below the best one for the sake of fewer charts.
@@ -80,7 +84,7 @@ class LayoutChoice:
         See `find_textures`.
     """
 
-    divide: Callable[[list[Chart], FloatArray, FloatArray, IntArray], list[Chart]]
+    divide: Divide
     into: Textures
     loss: float
     texture: IntArray
@@ -92,7 +96,9 @@ class LayoutChoice:
     def measure_area(self, V: FloatArray, F: IntArray) -> float:
         """Return the largest area of the triangles of a texture, given positions (n, 3) and all triangles (f, 3)."""
         numbers = np.unique(self.texture[self.texture >= 0]).tolist()
-        return max((surface_area(V, F[self.texture == k]) for k in numbers), default=surface_area(V, F))
+        if not numbers:
+            return surface_area(V, F)
+        return max(surface_area(V, F[self.texture == k]) for k in numbers)
 
     def is_generous(self, charts: list[Chart]) -> bool:
         """Whether unions of charts with much larger boxes than their parts can be worth their use of the texture."""
@@ -126,11 +132,11 @@ class LayoutChoice:
         groups = group_charts(charts, self.texture)
         if not self._are_comparable(groups):
             return 0.0
-        areas = [sum(chart.shape.area for chart in group) for group in groups]
-        uses = []
+        areas = [*map(measure_charts, groups)]
+        largest, uses = max(areas, default=0.0), []
         for group, area in zip(groups, areas, strict=True):
             if area > 0:
-                share = area / max(areas)
+                share = area / largest
                 uses.append(estimate_use([chart.shape for chart in group], self.into, above=above * share) / share)
         return min(uses, default=0.0)
 

@@ -16,7 +16,7 @@ from quasiharmonic.apps.unwrapping.symmetry import Symmetry, describe_symmetry
 from quasiharmonic.io.objects import make_trimesh
 from quasiharmonic.problem.inspection import describe_soup
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, count_of, find_exponent, names_of
-from quasiharmonic.util.outcome import Displayable, Outcome, as_plain
+from quasiharmonic.util.outcome import Displayable, Outcome, as_plain, replace_nonfinite
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -348,11 +348,11 @@ class UnwrapResult(Outcome, Displayable):
             "charts": self.n_charts,
             "kept_charts": int(self.kept_charts.sum()),
             "seam_edges": len(self.seams),
-            "seam_length": _replace_infinite(self.seam_length),
+            "seam_length": replace_nonfinite(self.seam_length),
             "stretch": _finite(self.stretch),
             "misses": [miss._asdict() | {"stretch": _finite(miss.stretch)} for miss in self.misses],
             **as_plain(self, "utilisation"),
-            "texels_per_unit": _replace_infinite(self.texels_per_unit),
+            "texels_per_unit": replace_nonfinite(self.texels_per_unit),
             "resolution": list(self.resolution),
             "strips": [strip._asdict() for strip in self.strips],
             "symmetry": self.symmetry._asdict(),
@@ -376,9 +376,4 @@ def _describe_strips(strips: tuple[Strip, ...]) -> str:
 
 def _finite(stretch: Stretch) -> dict[str, float | None]:
     """Return a stretch for JSON, which has neither infinity nor NaN."""
-    return {key: _replace_infinite(value) for key, value in stretch._asdict().items()}
-
-
-def _replace_infinite(value: float) -> float | None:
-    """Return a number for JSON: None if it is infinite or NaN."""
-    return value if np.isfinite(value) else None
+    return {key: replace_nonfinite(value) for key, value in stretch._asdict().items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY, Textures
 from quasiharmonic.apps.atlas.packing.pack import Packing
-from quasiharmonic.apps.unwrapping.chart import Chart, find_textures, group_charts, number_kinds
+from quasiharmonic.apps.unwrapping.chart import Chart, find_textures, group_charts, measure_charts, number_kinds
 from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, divide_long_charts, mend_charts
 from quasiharmonic.apps.unwrapping.chart_maps import THIN_ANGLE, WORST_STRETCH, smallest_angles
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certify_charts
@@ -22,6 +22,7 @@ from quasiharmonic.apps.unwrapping.cleaning import CleanedMesh, clean
 from quasiharmonic.apps.unwrapping.draft import Draft, expect_charts
 from quasiharmonic.apps.unwrapping.layout import (
     ChartLayout,
+    Divide,
     LayoutChoice,
     find_seams,
     join_charts,
@@ -106,12 +107,13 @@ class Task:
         """Tile (f',) of each triangle of the cleaned mesh, with ``tile_by``."""
         return None if self.tile is None else self.tile[self.cleaned.triangles]
 
-    def find_textures(self) -> IntArray:
-        """Return the texture (f',) of each triangle of the cleaned mesh; see `chart.find_textures`."""
+    @cached_property
+    def texture(self) -> IntArray:
+        """Texture (f',) of each triangle of the cleaned mesh; see `find_textures`."""
         return find_textures(self.cleaned_tile, self.wanted.stack, self.rules.mirror, self.points, self.cleaned.F)
 
     @property
-    def textures(self) -> Textures:
+    def into(self) -> Textures:
         """The texture, or several, that the charts share, or each of those with ``tile_by``."""
         return Textures(self.size, float(self.wanted.padding), self.wanted.tiles, self.wanted.rotate)
 
@@ -207,30 +209,22 @@ def _find_time_left(task: Task, began: float) -> float | None:
 def _find_charts(task: Task, draft: Draft) -> list[Chart]:
     """Return the charts of a model that keep the bound, and fit into the texture. ``draft`` has those so far."""
     charts, density = _search(task, draft, None), task.density
-    # Beside kept charts, it is unknown how long charts may be.
+    # With kept charts, it is unknown how long new ones may be.
     if density is None or task.kept is not None or task.rules.uv is not None:
         return charts
-    areas = [sum(chart.shape.area for chart in group) for group in group_charts(charts, task.find_textures())]
-    if max(areas, default=0.0) * density**2 > task.textures.texels:
+    area = max(map(measure_charts, group_charts(charts, task.texture)), default=0.0)
+    if area * density**2 > task.into.texels:
         # Shorter charts would not fit either.
         return charts
-    divided = _divide(task, charts, density)
+    divided = _make_divide(task, density)(charts, task.points, task.rules.cost, task.texture)
     if len(divided) == len(charts) or _fit(task, charts):
         return charts
     return divided if _fit(task, divided) else _search(task, draft, density)
 
 
-def _divide(task: Task, charts: list[Chart], density: float | None) -> list[Chart]:
-    """Divide charts that are too long for the texture, at the density if one is given."""
-    return divide_long_charts(
-        charts,
-        task.points,
-        task.rules.cost,
-        task.find_textures(),
-        wanted=task.wanted,
-        size=task.size,
-        density=density,
-    )
+def _make_divide(task: Task, density: float | None) -> Divide:
+    """Return a function that divides charts that are too long for the texture, at the density if one is given."""
+    return partial(divide_long_charts, wanted=task.wanted, size=task.size, density=density)
 
 
 def _fit(task: Task, charts: list[Chart]) -> bool:
@@ -251,8 +245,7 @@ def _search(task: Task, draft: Draft, density: float | None) -> list[Chart]:
         straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, task.bound, most)
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others, draft.strips = np.flatnonzero(rest), straight, strips
-    divide = partial(divide_long_charts, wanted=wanted, size=task.size, density=density)
-    texture = task.find_textures()
+    divide = _make_divide(task, density)
     charts = find_charts(
         points,
         cleaned.F[rest],
@@ -263,7 +256,7 @@ def _search(task: Task, draft: Draft, density: float | None) -> list[Chart]:
         uv=None if rules.uv is None else rules.uv[rest],
         mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
         draft=draft,
-        choose=LayoutChoice(divide, task.textures, float(wanted.packing_loss), texture[rest]),
+        choose=LayoutChoice(divide, task.into, float(wanted.packing_loss), task.texture[rest]),
         callback=task.report,
         jobs=wanted.jobs,
     )
@@ -272,7 +265,7 @@ def _search(task: Task, draft: Draft, density: float | None) -> list[Chart]:
         charts = [*straight, *(replace(chart, triangles=np.flatnonzero(rest)[chart.triangles]) for chart in charts)]
     if rules.uv is not None:
         return sorted(charts, key=lambda chart: int(chart.triangles[0]))
-    return _divide(task, charts, density)
+    return divide(charts, points, rules.cost, task.texture)
 
 
 def place_and_certify(task: Task, found: FoundCharts) -> PlacedCharts:

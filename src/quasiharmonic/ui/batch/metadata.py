@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
-from math import isfinite
 from pathlib import Path
 
 from quasiharmonic import __version__
@@ -22,6 +21,7 @@ from quasiharmonic.problem import Problem
 from quasiharmonic.problem.result import MapResult, Status
 from quasiharmonic.ui.batch.records import Record, describe_contents
 from quasiharmonic.util.arrays import FloatArray, IntArray
+from quasiharmonic.util.outcome import replace_nonfinite
 
 # Written to /proc/self/clear_refs, this number resets the peak resident memory (VmHWM) of the process; see proc(5).
 _RESET_PEAK = "5"
@@ -70,7 +70,7 @@ def describe_distortion(V: FloatArray, F: IntArray, uv: FloatArray) -> Record:
     if len(found.flat) == len(F):
         return {}
     values = {"mips": found.statistics("mips").mean, "isometric": found.statistics("isometric").maximum}
-    return {name: value if isfinite(value) else None for name, value in values.items()}
+    return {name: replace_nonfinite(value) for name, value in values.items()}
 
 
 @contextmanager

@@ -113,7 +113,7 @@ COLUMNS: dict[str, type] = {
 TABLES = "records.csv", "records.parquet"
 #: File name of the record in the folder of a problem's results.
 FILE = "record.json"
-# Start of the names of the material library and the images beside a map.
+# Start of the names of the material library of a map and its images.
 _LIBRARY = "map-texture"
 _ROWS = 1000
 _NO_TABLE = "cannot be read as a table: "
@@ -189,7 +189,7 @@ def describe_contents(data: bytes) -> Record:
 
 
 def read_map(path: Path) -> bytes | None:
-    """Return the contents of a map, or of a file beside it; None if it cannot be read."""
+    """Return the contents of a map, its library or an image; None if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError:
@@ -197,9 +197,9 @@ def read_map(path: Path) -> bytes | None:
 
 
 def read_library(folder: Path, data: bytes, stem: str) -> tuple[bytes, dict[str, bytes]]:
-    """Return a map, and the material library and the images beside it by name; the names begin with ``stem``."""
-    beside = {path.name: read_map(path) for path in sorted(folder.glob(_LIBRARY + "*"))}
-    found = {stem + name.removeprefix(_LIBRARY): file for name, file in beside.items() if file is not None}
+    """Return a map, and its material library and images by name; the names begin with ``stem``."""
+    contents = {path.name: read_map(path) for path in sorted(folder.glob(_LIBRARY + "*"))}
+    found = {stem + name.removeprefix(_LIBRARY): file for name, file in contents.items() if file is not None}
     if not found:
         return data, {}
     named = re.compile(rb"^(mtllib|map_K[de]|norm) " + _LIBRARY.encode(), re.MULTILINE)

@@ -43,6 +43,7 @@ from quasiharmonic.ui.batch.records import Record
 from quasiharmonic.ui.batch.settings import search_stages
 from quasiharmonic.ui.worker_pipes import open_pipes
 from quasiharmonic.util.options import PolishOptions
+from quasiharmonic.util.outcome import replace_nonfinite
 
 #: Key of the message that a process sends after its imports.
 READY = "ready"
@@ -175,9 +176,9 @@ def _unwrap_model(mesh: io.MeshData, options: dict[str, Any], path: Path, record
     stretch = {"stretch": result.stretch.p99, "isometric": result.stretch.worst}
     record |= {
         **sizes,
-        **{name: value if isfinite(value) else None for name, value in stretch.items()},
+        **{name: replace_nonfinite(value) for name, value in stretch.items()},
         "charts": result.n_charts,
-        "seam_length": result.seam_length,
+        "seam_length": replace_nonfinite(result.seam_length),
         "utilisation": result.utilisation,
         "cleaned": ", ".join(f"{name}: {rows.size}" for name, rows in changes if rows.size) or None,
         "status": result.status.name.lower(),

@@ -175,13 +175,13 @@ class ArchiveWriter(ResultWriter):
             record["error"] = record["error"].replace(str(files.results), record["source"])
         folder, key = self._orders.folder(files), self._key_of(files)
         data = None if record.get("map_bytes") is None else records.read_map(self._orders.map_path(folder))
-        beside: dict[str, bytes] = {}
+        library: dict[str, bytes] = {}
         if data is not None:
             # In OBJ files a blank ends a name. Different problems get different names.
             stem = re.sub(r"[\s%]", lambda match: f"%{ord(match[0]):02X}", posixpath.basename(key))
-            data, beside = records.read_library(folder, data, f"{stem}.texture")
+            data, library = records.read_library(folder, data, f"{stem}.texture")
             record |= records.describe_contents(data)
-        self._journal.add(Result(key, record, data, self._form, beside))
+        self._journal.add(Result(key, record, data, self._form, library))
 
     def fail(self, error: OSError) -> None:
         # Without an archive of results the next run tries again.

@@ -19,6 +19,7 @@ from quasiharmonic.ui.studio.protocol import Array
 from quasiharmonic.ui.studio.seams import find_seams, find_sides
 from quasiharmonic.ui.studio.state import SessionState
 from quasiharmonic.util.arrays import FloatArray, pad_to_space
+from quasiharmonic.util.outcome import replace_nonfinite
 
 Message = tuple[Mapping[str, Any], Mapping[str, Array]]
 
@@ -62,8 +63,8 @@ class DistortionMonitor:
                 energy = float(measured.share[defined] @ measured.symmetric_dirichlet[defined])
             worst = float(measured.isometric[defined].max()) if defined.any() else np.inf
             self._numbers = {
-                "energy": energy if np.isfinite(energy) else None,
-                "worst": worst if np.isfinite(worst) else None,
+                "energy": replace_nonfinite(energy),
+                "worst": replace_nonfinite(worst),
                 "used": _find_used_space(self._F, uv),
                 "packed": bool(uv.min() >= 0 and uv.max() <= 1),
                 "scale": measured.scale if np.isfinite(measured.scale) else 1.0,

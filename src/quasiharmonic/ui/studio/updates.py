@@ -27,6 +27,7 @@ from quasiharmonic.ui.studio.messages import (
 from quasiharmonic.ui.studio.protocol import Array
 from quasiharmonic.ui.studio.state import Numbering, SessionState
 from quasiharmonic.util.arrays import FloatArray
+from quasiharmonic.util.outcome import replace_nonfinite
 from quasiharmonic.util.progress import end_work
 
 Tell = Callable[[Mapping[str, Any], Mapping[str, Array]], None]
@@ -99,7 +100,7 @@ class PageUpdates:
         if hasattr(step, "phase"):
             self._tell({"kind": "progress", "phase": step.phase, "done": step.done, "total": step.total}, {})
         else:
-            self._tell({"kind": "progress", "flips": step.inverted, "energy": _finite(step.energy)}, {})
+            self._tell({"kind": "progress", "flips": step.inverted, "energy": replace_nonfinite(step.energy)}, {})
 
     def _keep(self, state: SessionState, *, fit: bool = False) -> None:
         """Add a state as the last one, and show it; it ends a drag, which belongs to the state before."""
@@ -162,7 +163,3 @@ class PageUpdates:
         if targets or (everything and not state.in_place):
             arrays["asked"] = find_asked_boundary(state, targets, self._origin)
         self._tell(header, arrays)
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

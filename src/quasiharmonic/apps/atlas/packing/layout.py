@@ -90,9 +90,7 @@ def find_layout(
 
 
 def _place_at(shapes: Sequence[Shape], into: Textures, scale: float, bitmaps: int = BITMAPS) -> Layout | None:
-    """Place shapes quickly at a given scale; None if they do not fit."""
-    if not _may_fit(shapes, into, scale):
-        return None
+    """Place shapes quickly at a given scale; None if that finds no layout."""
     search = BitmapSearch(shapes, into, scale, bitmaps=bitmaps)
     return search.place_in(search.cells)
 
@@ -219,8 +217,9 @@ def find_sufficient_size(shapes: Sequence[Shape], into: Textures, scale: float |
 
     def fits(size: tuple[int, int]) -> bool:
         larger = into._replace(size=size)
-        found = _place_boxes(shapes, larger) if scale is None else _place_at(shapes, larger, scale)
-        return found is not None
+        if scale is None:
+            return _place_boxes(shapes, larger) is not None
+        return _may_fit(shapes, larger, scale) and _place_at(shapes, larger, scale) is not None
 
     low, high = 1.0, 2.0
     while not fits(enlarge(high)):

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import replace
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +33,7 @@ from quasiharmonic.ui.cli.arguments import (
     weld,
 )
 from quasiharmonic.util.options import FlattenOptions
+from quasiharmonic.util.outcome import replace_nonfinite
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.atlas.mapped_atlas import MappedAtlas
@@ -169,12 +169,11 @@ def _check_options(options: argparse.Namespace) -> None:
 
 
 def _mean_energy(mapped: MappedAtlas) -> float | None:
-    """Return the final mean energy of a single bijective island; else None. JSON has neither infinity nor NaN."""
+    """Return the final mean energy of a single bijective island; else None."""
     first = mapped.islands[0].result
     if len(mapped.islands) > 1 or not (first.certificate.bijective and first.history):
         return None
-    energy = first.history[-1].energy
-    return energy if isfinite(energy) else None
+    return replace_nonfinite(first.history[-1].energy)
 
 
 def _weights(path: Path) -> list[float]:

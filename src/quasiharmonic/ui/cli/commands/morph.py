@@ -34,6 +34,7 @@ from quasiharmonic.ui.cli.arguments import (
 )
 from quasiharmonic.ui.cli.finite_elements import MOTIONS, in_order, list_motions, move_groups, read_tetrahedra
 from quasiharmonic.util.options import ENERGIES
+from quasiharmonic.util.outcome import replace_nonfinite
 
 if TYPE_CHECKING:
     from quasiharmonic.apps.mesh_motion.morph_result import MorphResult
@@ -151,7 +152,7 @@ def _morph_planar(options: argparse.Namespace, mesh: FemMesh) -> int:
             **morphed.to_dict(),
             "injective": not inverted.size,
             "inverted": inverted.tolist(),
-            "drift": drift if drift is None or isfinite(drift) else None,
+            "drift": None if drift is None else replace_nonfinite(drift),
             "moved": len(moved[0]),
             "reversed": reversed_rows,
             **pipeline.name_files(options),
