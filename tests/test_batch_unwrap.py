@@ -213,6 +213,13 @@ def test_the_report_shows_that_a_model_has_no_seams(tmp_path):
     assert cells[:5] == ["a", "1", "0", "1", "–"]
 
 
+def test_a_length_beyond_double_precision_is_not_recorded(tmp_path):
+    (tmp_path / "set").mkdir()
+    io.write_obj(tmp_path / "set" / "huge.obj", io.MeshData(V * (1e308 / np.abs(V).max()), F))
+    assert batch.run(tmp_path / "set", tmp_path / "out", settings(), jobs=1).solved == 1
+    assert record_of(tmp_path / "out", "huge.obj")["seam_length"] is None
+
+
 def test_other_settings_are_an_error(models, tmp_path, capsys):
     with pytest.raises(ValueError, match="flatten does not apply to unwrap"):
         batch.Settings(unwrap={}, flatten=True)
