@@ -19,6 +19,7 @@ from quasiharmonic.energies.energies import (
     Combination,
     Deformation,
     Energy,
+    Hardened,
     Isotropic,
     QuadraticForm,
     SymmetricDirichlet,
@@ -325,22 +326,25 @@ def positive_weights(weights: ArrayLike, f: int) -> FloatArray:
     return array
 
 
-#: The energies of a mixture, in the order of its factors.
+#: The energies of a mixture, in the order of its first factors.
 TERMS: tuple[Isotropic, ...] = MIPS(), SymmetricDirichlet(), ARAP(), AreaBarrier()
 
 
 def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
-    """The factors (4,) float64 that express an energy as a sum of `TERMS`, or None if it is not one.
+    """The factors (5,) float64 that express an energy, or None if there are none.
 
-    ``parts`` are the methods that the caller uses. A subclass of one of `TERMS` that does not override them counts as
-    that energy.
+    The first four are those of the sum of `TERMS`, and the last one the k with which it is `Hardened`. ``parts`` are the
+    methods that the caller uses. A subclass that does not override them counts as the class that has them.
     """
+    if isinstance(energy, Hardened) and _keeps(type(energy), Hardened, parts):
+        base = mixture_of(energy.base, *parts)
+        return None if base is None or base[-1] else np.append(base[:-1], energy.k)
     if type(energy) is not Combination:
         return _factors(type(energy), parts)
-    factors = np.zeros(len(TERMS))
+    factors = np.zeros(len(TERMS) + 1)
     for factor, term in energy.terms:
         part = mixture_of(term, *parts)
-        if part is None:
+        if part is None or part[-1]:
             return None
         factors += factor * part
     return factors
@@ -348,17 +352,23 @@ def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
 
 @cache
 def _factors(kind: type[Energy], parts: tuple[str, ...]) -> FloatArray | None:
-    for energy, factors in zip(TERMS, np.eye(len(TERMS)), strict=True):
-        own = type(energy)
-        if issubclass(kind, own) and all(getattr(kind, part) is getattr(own, part) for part in parts):
+    for energy, factors in zip(TERMS, np.eye(len(TERMS), len(TERMS) + 1), strict=True):
+        if _keeps(kind, type(energy), parts):
             return factors
     return None
 
 
+def _keeps(kind: type[Energy], base: type[Energy], parts: tuple[str, ...]) -> bool:
+    """Whether a class is ``base``, or a subclass that does not override some methods."""
+    return issubclass(kind, base) and all(getattr(kind, part) is getattr(base, part) for part in parts)
+
+
 def energy_of(mixture: FloatArray) -> Isotropic:
-    """The energy with the factors ``mixture`` of `TERMS`; the inverse of `mixture_of`."""
-    terms = [(float(factor), energy) for factor, energy in zip(mixture, TERMS, strict=True) if factor]
-    return terms[0][1] if len(terms) == 1 and terms[0][0] == 1 else Combination(*terms)
+    """The energy with the factors ``mixture``; the inverse of `mixture_of`."""
+    *factors, k = mixture.tolist()
+    terms = [(factor, energy) for factor, energy in zip(factors, TERMS, strict=True) if factor]
+    base = terms[0][1] if len(terms) == 1 and terms[0][0] == 1 else Combination(*terms)
+    return Hardened(base, k) if k else base
 
 
 @compiled

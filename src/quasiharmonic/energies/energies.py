@@ -430,6 +430,40 @@ class Combination(Isotropic):
         return aa, ab, bb
 
 
+class Hardened(Isotropic):
+    """``E + k E³`` of an energy E: few triangles with a large energy are worse than many.
+
+    Parameters
+    ----------
+    base : Isotropic
+        The energy E, not negative.
+    k : float
+        At least 0.
+    """
+
+    def __init__(self, base: Isotropic, k: float) -> None:
+        self.base, self.k = base, k
+        self.barrier = base.barrier
+
+    def density(self, d: Deformation) -> FloatArray:
+        """``E + k E³``."""
+        e = self.base.density(d)
+        return e + self.k * (e * e * e)
+
+    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
+        """``(1 + 3k E²) dE``."""
+        by_a, by_b = self.base.density_gradient(d)
+        factor = 1 + 3 * self.k * self.base.density(d) ** 2
+        return factor * by_a, factor * by_b
+
+    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """``(1 + 3k E²) d²E + 6k E dE²``."""
+        e, (by_a, by_b) = self.base.density(d), self.base.density_gradient(d)
+        aa, ab, bb = self.base.density_hessian(d)
+        factor, square = 1 + 3 * self.k * e**2, 6 * self.k * e
+        return factor * aa + square * by_a**2, factor * ab + square * by_a * by_b, factor * bb + square * by_b**2
+
+
 def conformal_area_blend(theta: float = 1 / 128) -> Combination:
     """``(1 − θ) MIPS + θ E_a``: the energy of Garanzha et al. (§10.2), by default with their θ.
 

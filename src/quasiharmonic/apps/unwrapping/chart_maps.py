@@ -20,11 +20,13 @@ from quasiharmonic.apps.flattening.piece import COARSE_FROM, Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import descend_on_patches
 from quasiharmonic.energies.deformation import DeformationEnergy
-from quasiharmonic.energies.energies import Deformation, Energy, Isotropic, SymmetricDirichlet
+from quasiharmonic.energies.energies import Energy, Hardened, SymmetricDirichlet
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
+from quasiharmonic.energies.newton.laplacian_descent import LaplacianDescent
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
+from quasiharmonic.linsolve import available
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.options import FlattenOptions
 
@@ -51,8 +53,13 @@ class ChartTuning(NamedTuple):
     nothing: float = 1e-5
     # Smallest energy at the bound that `EvenStretch` uses.
     least_energy: float = 0.1
-    # From mean energies below this, Newton steps are used directly.
+    # Number of quasi-Newton steps that count as one step.
+    window: int = 5
+    # From mean energies below this, quasi-Newton steps are used.
     near: float = 1.0
+    # Charts with at most this number of vertices get the linear solver for small systems. It takes half the time there,
+    # though more than others for compact meshes of this size.
+    narrow: int = 5_000
     # Boundary vertices are rounded to this multiple of the root of the area before contacts are sought.
     gap: float = 2.0**-20
 
@@ -60,7 +67,7 @@ class ChartTuning(NamedTuple):
 _TUNING = ChartTuning()
 
 
-class EvenStretch(Isotropic):
+class EvenStretch(Hardened):
     """``E + k E³`` with the symmetric Dirichlet energy E: few triangles with large stretch are worse than many.
 
     Parameters
@@ -69,29 +76,8 @@ class EvenStretch(Isotropic):
         Above 1. Where one singular value has this stretch and the other is 1, the second term is three times the first.
     """
 
-    barrier = True
-
     def __init__(self, bound: float) -> None:
-        self._base = SymmetricDirichlet()
-        self._k = 3 / max((bound - 1 / bound) ** 2, _TUNING.least_energy) ** 2
-
-    def density(self, d: Deformation) -> FloatArray:
-        """``E + k E³``."""
-        e = self._base.density(d)
-        return e + self._k * e**3
-
-    def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
-        """``(1 + 3k E²) dE``."""
-        by_a, by_b = self._base.density_gradient(d)
-        factor = 1 + 3 * self._k * self._base.density(d) ** 2
-        return factor * by_a, factor * by_b
-
-    def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """``(1 + 3k E²) d²E + 6k E dE²``."""
-        e, (by_a, by_b) = self._base.density(d), self._base.density_gradient(d)
-        aa, ab, bb = self._base.density_hessian(d)
-        factor, square = 1 + 3 * self._k * e**2, 6 * self._k * e
-        return factor * aa + square * by_a**2, factor * ab + square * by_a * by_b, factor * bb + square * by_b**2
+        super().__init__(SymmetricDirichlet(), 3 / max((bound - 1 / bound) ** 2, _TUNING.least_energy) ** 2)
 
 
 @dataclass(eq=False)
@@ -147,6 +133,11 @@ class WorkingChart:
     def share_over(self, bound: float) -> float:
         """Share of the area that is stretched beyond the bound."""
         return float(self.area[self.over(bound)].sum())
+
+    @property
+    def linear_solver(self) -> str:
+        """The linear solver for systems of the chart: charts are narrow, so small ones have little fill."""
+        return available(0)[0] if len(self.V) <= _TUNING.narrow else "auto"
 
     @property
     def too_long(self) -> BoolArray:
@@ -235,20 +226,46 @@ def _initial_map(piece: Piece) -> FloatArray | None:
 def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> None:
     """Lower an energy of the chart's map, which stays injective."""
     assert chart.uv is not None
-    value = chart.piece.energy(density, None).value(in_units(chart.uv, 0))
-    far = value > _TUNING.near and isinstance(density, SymmetricDirichlet)
-    energy = chart.piece.energy(ReweightedDirichlet() if far else density, None)
-    descent = SurfaceDescent(energy, chart.uv, "auto")
-    before = np.inf
     try:
-        for _ in itertools.islice(descend(descent, density, _TUNING.tolerance), _TUNING.max_steps):
-            check_wanted()
-            if descent.distortion < _TUNING.nothing or descent.distortion > (1 - _TUNING.slow) * before:
-                break
-            before = descent.distortion
+        if _approach(chart, density, check_wanted):
+            _finish(chart, density, check_wanted)
     finally:
         # After a time limit, the chart has the map so far.
-        chart.use(descent.uv)
+        chart.use(chart.uv)
+
+
+def _approach(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> bool:
+    """Take Newton's steps until the map is near the minimum; return False if they end before."""
+    assert chart.uv is not None
+    energy = chart.piece.energy(density, None)
+    before = energy.value(in_units(chart.uv, 0))
+    if before <= _TUNING.near:
+        return True
+    if isinstance(density, SymmetricDirichlet):
+        energy = energy.with_density(ReweightedDirichlet())
+    descent = SurfaceDescent(energy, chart.uv, chart.linear_solver)
+    for _ in itertools.islice(descend(descent, density, _TUNING.tolerance), _TUNING.max_steps):
+        chart.uv = descent.uv
+        check_wanted()
+        if descent.distortion <= _TUNING.near:
+            return True
+        if descent.distortion > (1 - _TUNING.slow) * before:
+            return False
+        before = descent.distortion
+    return False
+
+
+def _finish(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> None:
+    """Take quasi-Newton steps until they are slow."""
+    assert chart.uv is not None
+    descent = LaplacianDescent(chart.piece.energy(density, None), chart.uv, chart.linear_solver)
+    values = [descent.value]
+    while len(values) <= _TUNING.max_steps and values[-1] >= _TUNING.nothing and descent.step():
+        chart.uv = descent.uv
+        check_wanted()
+        if len(values) >= _TUNING.window and descent.value > (1 - _TUNING.slow) * values[-_TUNING.window]:
+            break
+        values.append(descent.value)
 
 
 def _relax_long(chart: WorkingChart, bound: float) -> None:
@@ -260,6 +277,6 @@ def _relax_long(chart: WorkingChart, bound: float) -> None:
         return
     assert chart.uv is not None
     density = EvenStretch(bound)
-    moved = descend_on_patches(chart.piece.energy(density, None), density, chart.uv, chart.too_long, "auto")
+    moved = descend_on_patches(chart.piece.energy(density, None), density, chart.uv, chart.too_long, chart.linear_solver)
     if moved is not None:
         chart.use(moved)

@@ -106,7 +106,7 @@ def separate(chart: WorkingChart, bound: float, check_wanted: Callable[[], objec
     energy = chart.piece.energy(EvenStretch(bound), None)
     fixed = _find_far_vertices(chart)
     pairs = Penetrations(_TUNING.weight / len(chart.F))
-    system = NewtonSystem(energy.F, energy.g, len(chart.uv), fixed, "auto")
+    system = NewtonSystem(energy.F, energy.g, len(chart.uv), fixed, chart.linear_solver)
     coordinates = Coordinates.of(chart.uv, fixed, 0)
     model = MapModel(energy, coordinates, system, [pairs])
     w, crossings = in_units(chart.uv, 0), chart.crossings

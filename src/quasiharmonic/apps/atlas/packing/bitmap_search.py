@@ -23,7 +23,7 @@ MANY = 50
 #: Charts beyond this number are placed as boxes, the smallest ones.
 BITMAPS = 500
 #: Placements tried with other orders of the charts, in all.
-TRIALS = 120
+TRIALS = 80
 #: Largest number of cells along a tile.
 MOST_CELLS = 2048
 #: The number of cells along a tile is at most this multiple of the expected number.
@@ -34,9 +34,9 @@ class BitmapTuning(NamedTuple):
     """Numbers that tune the boards; charts are few up to `MANY`, and many above."""
 
     # Expected number of cells along a tile for few charts.
-    cells: int = 128
+    cells: int = 112
     # The same on the finer board, which is for the final layout of few charts.
-    fine_cells: int = 384
+    fine_cells: int = 320
     # Number of few charts on a tile from which cells are proportionally smaller.
     charts_per_tile: int = 36
     # Expected number of cells along a tile for many charts.

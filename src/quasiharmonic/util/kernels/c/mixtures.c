@@ -1,4 +1,5 @@
-/* Kernels of `energies/deformation.py`: sums of the library's isotropic energies, in a = |p|^2 and b = |q|^2. */
+/* Kernels of `energies/deformation.py`: sums of the library's isotropic energies, in a = |p|^2 and b = |q|^2. A sum E
+   can be hardened to E + k E^3. */
 #include "arguments.h"
 
 #include <math.h>
@@ -7,8 +8,8 @@
 /* Triangles at a time: what is in between stays in the core's first cache, and is made by loops without jumps. */
 enum { CHUNK = 128 };
 
-/* The order of `OWN`. */
-enum { MIPS, SYMMETRIC_DIRICHLET, ARAP, AREA_BARRIER, KINDS };
+/* The order of `TERMS`, and the factor k. */
+enum { MIPS, SYMMETRIC_DIRICHLET, ARAP, AREA_BARRIER, CUBE, FACTORS };
 
 typedef struct {
     Py_ssize_t size;
@@ -43,7 +44,7 @@ static double positive(double det)
     return det > 0 ? det : NAN;
 }
 
-static void add_density(const double *mixture, const Squares *d, double *density)
+static void add_densities(const double *mixture, const Squares *d, double *density)
 {
     const Py_ssize_t size = d->size;
     const double *a = d->a, *b = d->b, *det = d->det;
@@ -74,12 +75,21 @@ static void add_density(const double *mixture, const Squares *d, double *density
         }
 }
 
-static void take_slopes(const double *mixture, const Squares *d, Slopes *slopes)
+static void take_densities(const double *mixture, const Squares *d, double *density)
+{
+    const double k = mixture[CUBE];
+    memset(density, 0, CHUNK * sizeof *density);
+    add_densities(mixture, d, density);
+    if (k != 0)
+        for (Py_ssize_t j = 0; j < d->size; j++)
+            density[j] += k * (density[j] * density[j] * density[j]);
+}
+
+static void add_slopes(const double *mixture, const Squares *d, Slopes *slopes)
 {
     const Py_ssize_t size = d->size;
     const double *a = d->a, *b = d->b, *det = d->det;
     double *by_a = slopes->a, *by_b = slopes->b;
-    memset(slopes, 0, sizeof *slopes);
     double c = mixture[MIPS];
     if (c != 0)
         for (Py_ssize_t j = 0; j < size; j++) {
@@ -111,12 +121,27 @@ static void take_slopes(const double *mixture, const Squares *d, Slopes *slopes)
         }
 }
 
-static void take_bends(const double *mixture, const Squares *d, Bends *bends)
+static void take_slopes(const double *mixture, const Squares *d, Slopes *slopes)
+{
+    const double k = mixture[CUBE];
+    memset(slopes, 0, sizeof *slopes);
+    add_slopes(mixture, d, slopes);
+    if (k == 0)
+        return;
+    double density[CHUNK] = {0};
+    add_densities(mixture, d, density);
+    for (Py_ssize_t j = 0; j < d->size; j++) {
+        const double factor = 1 + 3 * k * (density[j] * density[j]);
+        slopes->a[j] *= factor;
+        slopes->b[j] *= factor;
+    }
+}
+
+static void add_bends(const double *mixture, const Squares *d, Bends *bends)
 {
     const Py_ssize_t size = d->size;
     const double *a = d->a, *b = d->b, *det = d->det;
     double *aa = bends->aa, *ab = bends->ab, *bb = bends->bb;
-    memset(bends, 0, sizeof *bends);
     double c = mixture[MIPS];
     if (c != 0)
         for (Py_ssize_t j = 0; j < size; j++) {
@@ -150,6 +175,26 @@ static void take_bends(const double *mixture, const Squares *d, Bends *bends)
         }
 }
 
+static void take_bends(const double *mixture, const Squares *d, Bends *bends)
+{
+    const double k = mixture[CUBE];
+    memset(bends, 0, sizeof *bends);
+    add_bends(mixture, d, bends);
+    if (k == 0)
+        return;
+    double density[CHUNK] = {0};
+    Slopes slopes = {{0}, {0}};
+    add_densities(mixture, d, density);
+    add_slopes(mixture, d, &slopes);
+    for (Py_ssize_t j = 0; j < d->size; j++) {
+        const double e = density[j], factor = 1 + 3 * k * (e * e), square = 6 * k * e;
+        const double by_a = slopes.a[j], by_b = slopes.b[j];
+        bends->aa[j] = factor * bends->aa[j] + square * (by_a * by_a);
+        bends->ab[j] = factor * bends->ab[j] + square * (by_a * by_b);
+        bends->bb[j] = factor * bends->bb[j] + square * (by_b * by_b);
+    }
+}
+
 /* (mixture, p, q, det, share): the sum over triangles. */
 static PyObject *mixed_energy(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
@@ -160,7 +205,7 @@ static PyObject *mixed_energy(PyObject *module, PyObject *const *given, Py_ssize
     const double *mixture = arguments[0].data, *share = arguments[4].data;
     const Py_ssize_t f = arguments[3].size;
     if (!fit("mixed_energy", arguments, LENGTH(arguments),
-             arguments[0].size == KINDS && arguments[1].size == f && arguments[2].size == f &&
+             arguments[0].size == FACTORS && arguments[1].size == f && arguments[2].size == f &&
              arguments[4].size == f))
         return NULL;
     double total = 0, lost = 0, plain = 0;
@@ -168,8 +213,8 @@ static PyObject *mixed_energy(PyObject *module, PyObject *const *given, Py_ssize
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t start = 0; start < f; start += CHUNK) {
         take_squares(arguments[1].data, arguments[2].data, arguments[3].data, start, f, &d);
-        double density[CHUNK] = {0}, part[4] = {0};
-        add_density(mixture, &d, density);
+        double density[CHUNK], part[4] = {0};
+        take_densities(mixture, &d, density);
         for (Py_ssize_t j = 0; j < d.size; j++)
             density[j] *= share[start + j];
         for (Py_ssize_t j = 0; j < CHUNK; j += 4)
@@ -197,7 +242,7 @@ static PyObject *mixed_slopes(PyObject *module, PyObject *const *given, Py_ssize
     double *by_p = arguments[4].data, *by_q = arguments[5].data;
     const Py_ssize_t f = arguments[3].size;
     if (!fit("mixed_slopes", arguments, LENGTH(arguments),
-             arguments[0].size == KINDS && arguments[1].size == f && arguments[2].size == f &&
+             arguments[0].size == FACTORS && arguments[1].size == f && arguments[2].size == f &&
              arguments[4].size == f && arguments[5].size == f))
         return NULL;
     Squares d;
@@ -272,7 +317,7 @@ static PyObject *mixed_curvature(PyObject *module, PyObject *const *given, Py_ss
     double *pq = arguments[10].data, *pqc = arguments[11].data;
     const Py_ssize_t f = arguments[3].size;
     if (!fit("mixed_curvature", arguments, LENGTH(arguments),
-             arguments[0].size == KINDS && arguments[1].size == f && arguments[2].size == f &&
+             arguments[0].size == FACTORS && arguments[1].size == f && arguments[2].size == f &&
              arguments[4].size == f && arguments[6].size == f && arguments[7].size == f &&
              arguments[8].size == f && arguments[9].size == f && arguments[10].size == f &&
              arguments[11].size == f))
