@@ -68,6 +68,7 @@ def divide_long_charts(
     wanted: UnwrapOptions,
     size: tuple[int, int],
     density: float | None,
+    area: float | None = None,
 ) -> list[Chart]:
     """Divide charts across their middle until each fits into a texture that the charts cover well.
 
@@ -89,6 +90,8 @@ def divide_long_charts(
         Width and height of the texture.
     density : float or None
         Texels per unit of length, if they are given.
+    area : float, optional
+        Area of the charts of the fullest texture, if there are others than these.
 
     Returns
     -------
@@ -96,7 +99,8 @@ def divide_long_charts(
         Ordered by first triangle.
     """
     for_packing = wanted.divide_for_packing
-    area = max(map(measure_charts, group_charts(charts, texture)), default=0.0)
+    if area is None:
+        area = max(map(measure_charts, group_charts(charts, texture)), default=0.0)
     ratio = max(size) / min(size)
     side = float(np.sqrt(area * ratio / (_TUNING.expected_use * wanted.tiles)))
     longest_flat = _TUNING.longest_flat * side

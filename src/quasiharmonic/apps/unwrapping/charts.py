@@ -111,13 +111,20 @@ def find_charts(
     total = surface_area(V, F)
     divisible = None if max_charts is None else max_charts - len(charts)
 
+    def divide(found: list[Chart], points: FloatArray, own: FloatArray, unit: float) -> list[Chart]:
+        """Divide charts of a coarse mesh that are too long for the texture."""
+        if choose is None:
+            return found
+        area = choose.measure_area(V, F) / unit**2
+        return choose.divide(found, points, own, np.zeros(len(own), dtype=np.int64), area=area)
+
     def cut(some: IntArray) -> list[WorkingChart]:
         """Cut triangles into disks, or a large surface into charts."""
         at_sides = given[are_sides(given, F[some], len(V))]
         vertices = np.flatnonzero(mark(len(V), F[some]))
         own = invert_indices(len(V), vertices)[F[some]]
         points, gain = V[vertices], min_gain if len(at_sides) else _MIN_GAIN
-        search = CoarseSearch(max_stretch, min_gain, workers, points) if coarse else None
+        search = CoarseSearch(max_stretch, min_gain, workers, points, divide) if coarse else None
         found = cut_into_charts(points, own, np.searchsorted(vertices, at_sides), cost[some], gain, search)
         for chart in found:
             chart.triangles, chart.vertices = some[chart.triangles], vertices[chart.vertices]

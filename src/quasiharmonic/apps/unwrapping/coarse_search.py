@@ -1,6 +1,7 @@
 """Charts of a large surface from those of a coarse mesh: their seams, and initial maps close to the final ones.
 
-The seams of all charts of the coarse mesh are carried to the surface and shortened there. A vertex in the interior of a
+Coarse charts that are too long for the texture are divided. The seams of all charts are then carried to the surface and
+shortened there. A vertex in the interior of a
 coarse chart keeps its position in that chart's map, and so do vertices that are inserted between such vertices. They
 give the rotations of their triangles. The triangles near seams get theirs by unfolding from their neighbours. The map
 is fitted to the rotated triangles [1]_, then to the nearest ones that are stretched little, which is repeated. All
@@ -18,11 +19,13 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from quasiharmonic.apps.flattening.worst_triangles import mark_around
+from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
 from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, NO_CUT, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
 from quasiharmonic.energies.energies import SymmetricDirichlet
@@ -32,7 +35,7 @@ from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.splitting import split_parts
-from quasiharmonic.geometry.mesh.topology import find_pairs
+from quasiharmonic.geometry.mesh.topology import boundary_edges, find_pairs
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian
 from quasiharmonic.targets.cuts.find import find_cuts_by
@@ -68,6 +71,10 @@ class FitTuning(NamedTuple):
 _TUNING = FitTuning()
 
 
+#: Divides long charts of a coarse mesh, given its positions (m, 3), its costs (k, 3), and its unit of length.
+DivideCoarse = Callable[[list[Chart], FloatArray, FloatArray, float], list[Chart]]
+
+
 class CoarseSearch:
     """A search for charts on the coarse mesh of a surface with vertices ``V`` (n, 3).
 
@@ -75,8 +82,8 @@ class CoarseSearch:
     carried the seams to the surface, `start` gives the charts between them the maps of the coarse charts.
     """
 
-    def __init__(self, bound: float, min_gain: float, workers: Workers, V: FloatArray) -> None:
-        self._bound, self._min_gain, self._workers, self._V = bound, min_gain, workers, V
+    def __init__(self, bound: float, min_gain: float, workers: Workers, V: FloatArray, divide: DivideCoarse) -> None:
+        self._bound, self._min_gain, self._workers, self._V, self._divide = bound, min_gain, workers, V, divide
         # The coarse chart of each vertex, -1 where it is unknown, as on seams, and the vertex's position there.
         self._chart, self._place = np.full(len(V), -1), np.zeros(len(V), dtype=np.complex128)
         # Number of coarse charts of all calls.
@@ -87,9 +94,14 @@ class CoarseSearch:
         F = graph.F
         # The factors on the costs of the sides: the costs, over what they would be without factors.
         cost = (graph.cost / edge_graph(graph.V, F).cost)[graph.side].T
+        unit = float(np.sqrt(surface_area(self._V[vertices], F)))
         coarser = None
         if graph.n <= _TUNING.largest_share * len(self._V):
-            coarser = CoarseSearch(self._bound, self._min_gain, self._workers, graph.V)
+
+            def divide(charts: list[Chart], V: FloatArray, cost: FloatArray, part: float) -> list[Chart]:
+                return self._divide(charts, V, cost, unit * part)
+
+            coarser = CoarseSearch(self._bound, self._min_gain, self._workers, graph.V, divide)
         found = search_charts(
             cut_into_charts(graph.V, F, NO_CUT, cost, self._min_gain, coarser),
             self._bound,
@@ -100,13 +112,11 @@ class CoarseSearch:
             keep=lambda charts: None,
         )
         seams = np.zeros(len(graph.ends), dtype=bool)
-        for chart in found:
-            assert chart.uv is not None
+        for chart in self._divide([finish_chart(chart, 0.0) for chart in found], graph.V, cost, unit):
             self._chart[vertices[chart.vertices]] = self._count
             self._place[vertices[chart.vertices]] = to_complex(chart.uv)
             self._count += 1
-            for loop in chart.piece.loops:
-                seams[graph.numbers(*chart.vertices[np.stack([loop, np.roll(loop, -1)])])] = True
+            seams[graph.numbers(*chart.vertices[boundary_edges(chart.F, len(chart.uv))].T)] = True
         self._chart[vertices[graph.mark_vertices(seams)]] = -1
         self._prolong(rounds)
         return seams & ~graph.rim

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -65,8 +66,13 @@ class ChartLayout:
         return np.where(self.mirrored[:, None], self.rows[:, ::-1], self.rows)
 
 
-#: Divides long charts, given positions (n, 3), costs (f, 3) and textures (f,) of the surface.
-Divide = Callable[[list[Chart], FloatArray, FloatArray, IntArray], list[Chart]]
+
+class Divide(Protocol):
+    """Divide long charts, given positions (n, 3), costs (f, 3) and textures (f,); see `divide_long_charts`."""
+
+    def __call__(
+        self, charts: list[Chart], V: FloatArray, cost: FloatArray, texture: IntArray, *, area: float | None = None
+    ) -> list[Chart]: ...
 
 
 @dataclass(frozen=True, eq=False)

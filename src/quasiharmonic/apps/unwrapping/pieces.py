@@ -57,6 +57,8 @@ class PieceTuning(NamedTuple):
     angles: tuple[float, ...] = (20.0, 13.0, 9.0, 6.0, 4.0)
     # There, a piece has at least this share.
     min_share: float = 0.15
+    # More triangles than this cannot be a compact piece unless some of them are flat; see `_mark_flat`.
+    many_triangles: int = 2_000
     # There, the squared perimeter of a piece is at most this multiple of its area.
     max_perimeter: float = 40.0
     # Pieces with a smaller share are dropped if they mostly border on curved parts.
@@ -245,9 +247,13 @@ def find_pieces(
     length = np.linalg.norm(V[F] - V[np.roll(F, -1, axis=1)], axis=2)
     found = Pieces(np.full(len(F), -1), np.zeros(F.shape, dtype=np.complex128), np.zeros(hinges.one.size, dtype=bool))
     torus = find_coarse_tori(V, F, hinges, max_stretch, apart)
+    flat = _mark_flat(F, hinges, angles, len(V))
     for angle in (CREASE, *np.deg2rad(_TUNING.angles), 0.0):
         heartbeat()
         rest = (found.label < 0) & ~torus
+        if 0 < angle < CREASE and np.count_nonzero(rest) > _TUNING.many_triangles:
+            if area[rest & flat].sum() < _TUNING.min_share:
+                continue
         within = ~apart & rest[hinges.first] & rest[hinges.second]
         # What is left between pieces can be developable as a whole, with its creases.
         joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat | together) if angle else within
@@ -265,6 +271,17 @@ def find_pieces(
         if (torus | (found.label >= 0)).all():
             break
     return found
+
+
+def _mark_flat(F: IntArray, hinges: Hinges, angles: FloatArray, n: int) -> BoolArray:
+    """Mark the triangles (f,) with a corner that has no curvature, or in one plane with a neighbour.
+
+    Vertices with curvature are on the outline of a developable piece, with few exceptions. So the only pieces without
+    such triangles are thin strips, and fans around a vertex.
+    """
+    total = np.bincount(F.ravel(), angles.ravel(), n)
+    flat = np.abs(2 * np.pi - total) <= _TUNING.defect
+    return flat[F].any(axis=1) | mark(len(F), hinges.first[hinges.flat], hinges.second[hinges.flat])
 
 
 def _unroll(

@@ -17,6 +17,8 @@ _TOLERANCE = 1e-6
 _AXES = "xyz"
 # A smaller share of mirror images is due to chance.
 _WORTH_REPORTING = 0.9
+# Of about so many vertices, all over a model, this share may lack an image; otherwise the model is not examined further.
+_SAMPLES, _MOST_WITHOUT = 500, 0.5
 
 
 class Symmetry(NamedTuple):
@@ -99,6 +101,10 @@ def find_mirror(V: FloatArray, F: IntArray, axis: str) -> tuple[Mirror | None, S
             continue
         mirrored = V.copy()
         mirrored[:, k] = low[k] + high[k] - V[:, k]
+        if axis == "auto":
+            some, _ = tree.query(mirrored[:: max(len(V) // _SAMPLES, 1)], distance_upper_bound=reach)
+            if np.isinf(some).mean() > _MOST_WITHOUT:
+                continue
         distance, image = tree.query(mirrored, distance_upper_bound=reach)
         there = np.isfinite(distance)
         share = float(np.count_nonzero(there)) / len(V)
