@@ -36,6 +36,8 @@ from quasiharmonic.util.arrays import (
 
 # A surface with more vertices is cut on a coarse mesh first, which has this number of vertices.
 _LARGE, _COARSE = 5_000, 4_000
+# The search for charts of a surface with more vertices begins on a mesh with this number of vertices.
+_LARGER, _COARSER = 10_000, 2_500
 # A surface with more vertices is cut on a mesh with this share of them, smoothed by this number of sweeps, if its cuts
 # are found on a coarser mesh in turn.
 _HUGE, _SHARE, _SWEEPS = 80_000, 1 / 8, 3
@@ -164,9 +166,13 @@ def find_cuts_by(
                 own = [[Removal(names[gone], names[rings]) for gone, rings in removals] for removals in rounds]
                 return find_coarse(graph, names[some], own)
 
-            huge = find_coarse is not None and vertices.size > _HUGE
-            goal, sweeps = (int(_SHARE * vertices.size), _SWEEPS) if huge else (_COARSE, 0)
-            every = 1 if find_coarse is None else _EVERY
+            goal, sweeps, every = _COARSE, 0, 1
+            if find_coarse is not None:
+                every = _EVERY
+                if vertices.size > _HUGE:
+                    goal, sweeps = int(_SHARE * vertices.size), _SWEEPS
+                elif vertices.size > _LARGER:
+                    goal = _COARSER
             cut = cut_by_levels(V[names], T, own, find, rings, goal=goal, sweeps=sweeps, every=every)
         else:
             graph = edge_graph(V[names], T, own)
