@@ -13,6 +13,7 @@ from quasiharmonic.energies.energies import (
     MIPS,
     AreaPreserving,
     Combination,
+    Hardened,
     Isotropic,
     QuadraticForm,
     SymmetricDirichlet,
@@ -85,7 +86,13 @@ class Restated(Isotropic):
         return self.energy.density_hessian(d)
 
 
-@pytest.mark.parametrize("energy", [*ENERGIES.values(), Combination((2.0, conformal_area_blend()), (0.5, MIPS()))])
+BLEND = Combination((2.0, conformal_area_blend()), (0.5, MIPS()))
+
+
+@pytest.mark.parametrize(
+    "energy",
+    [*ENERGIES.values(), BLEND, Hardened(BLEND, 0.3), Combination((1.0, Hardened(MIPS(), 2.0)), (1.0, ARAP()))],
+)
 def test_the_package_s_energies_agree_with_their_methods(energy, rng):
     V, F, w = bowl(300)
     weights = rng.uniform(0, 2, len(F))

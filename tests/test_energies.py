@@ -14,6 +14,7 @@ from quasiharmonic.energies.energies import (
     AreaPreserving,
     Combination,
     Deformation,
+    Hardened,
     SymmetricDirichlet,
     conformal_area_blend,
 )
@@ -31,6 +32,7 @@ ISOTROPIC = [
     AreaBarrier(),
     conformal_area_blend(0.2),
     Combination((1.0, ARAP()), (0.1, AreaBarrier())),
+    Hardened(SymmetricDirichlet(), 0.5),
 ]
 INVERTIBLE = [ARAP(), AreaPreserving()]
 

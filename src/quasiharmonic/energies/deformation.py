@@ -333,7 +333,7 @@ TERMS: tuple[Isotropic, ...] = MIPS(), SymmetricDirichlet(), ARAP(), AreaBarrier
 def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
     """The factors (5,) float64 that express an energy, or None if there are none.
 
-    The first four are those of the sum of `TERMS`, and the last one the k with which it is `Hardened`. ``parts`` are the
+    The first four are those of the sum of `TERMS`. The last one is the k with which it is `Hardened`. ``parts`` are the
     methods that the caller uses. A subclass that does not override them counts as the class that has them.
     """
     if isinstance(energy, Hardened) and _keeps(type(energy), Hardened, parts):

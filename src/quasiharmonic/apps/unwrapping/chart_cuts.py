@@ -81,10 +81,10 @@ def extend_cuts(chart: WorkingChart, bound: float) -> WorkingChart | None:
     return longer
 
 
-def divide_overlap(chart: WorkingChart) -> list[WorkingChart]:
-    """Divide a chart into two or more along a short line between parts that overlap each other."""
+def divide_overlap(chart: WorkingChart, crossings: IntArray) -> list[WorkingChart]:
+    """Divide a chart into two or more along a short line between parts that overlap, given crossings (c, 4)."""
     graph = _graph(chart)
-    one, other = _overlapping_parts(chart)
+    one, other = _overlapping_parts(chart, crossings)
     parts = _open(chart, _line_between(chart, graph, one, other)[graph.side].T)
     if max(len(part.F) for part in parts) < (1 - _TUNING.min_part) * len(chart.F):
         return parts
@@ -126,14 +126,14 @@ def _graph(chart: WorkingChart) -> EdgeGraph:
     return edge_graph(chart.V, chart.F, chart.cost)
 
 
-def _overlapping_parts(chart: WorkingChart) -> tuple[IntArray, IntArray]:
+def _overlapping_parts(chart: WorkingChart, crossings: IntArray) -> tuple[IntArray, IntArray]:
     """Boundary vertices of two parts of a chart that overlap each other.
 
     One part lies on one arc of the boundary, the other outside of this arc. Of all arcs between sampled boundary
     vertices, the one that parts most crossings is used, and of several the longest.
     """
     loop = np.concatenate(chart.piece.loops)
-    pairs = invert_indices(len(chart.V), loop)[chart.crossings[:, (0, 2)]]
+    pairs = invert_indices(len(chart.V), loop)[crossings[:, (0, 2)]]
     count = min(loop.size, _TUNING.samples)
     bins = pairs * count // loop.size
     crossed = np.zeros((count, count))

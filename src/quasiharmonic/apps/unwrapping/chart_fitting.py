@@ -241,9 +241,7 @@ def _divide_faulty(
     bad = mark(len(chart.F), verdict.inverted, verdict.degenerate)
     bad |= np.isin(chart.F, verdict.multiply_wound).any(axis=1)
     if len(verdict.crossings) and not bad.any():
-        working = chart.open(V, cost)
-        working.crossings = verdict.crossings
-        parts = divide_overlap(working)
+        parts = divide_overlap(chart.open(V, cost), verdict.crossings)
         if len(parts) > 1:
             return [chart.part(one, bound) for one in parts]
     bad |= low & bad.any()

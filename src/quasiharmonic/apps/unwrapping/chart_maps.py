@@ -99,10 +99,6 @@ class WorkingChart:
         An injective map, in the unit of `piece`, or None.
     stretch : (k,) float64
         The larger of σ₁ and 1/σ₂ on each triangle, if the map has the surface's area; infinite without a map.
-    crossings : (c, 4) int64
-        Pairs of boundary edges that intersect or almost touch.
-    bijective : bool
-        Whether the map covers no point twice, and its boundary stays away from itself.
     """
 
     triangles: IntArray
@@ -112,12 +108,12 @@ class WorkingChart:
     cost: FloatArray
     uv: FloatArray | None = None
     stretch: FloatArray = field(default_factory=lambda: np.empty(0))
-    crossings: IntArray = field(default_factory=lambda: np.empty((0, 4), dtype=np.int64))
-    bijective: bool = False
     # An injective map from which the first descent starts, if there is a good one.
     start: FloatArray | None = None
     # Number of successive extensions of cuts that lowered the stretch too little.
     failures: int = 0
+    # The value of `crossings` and `bijective`, once they have been asked for.
+    _contacts: tuple[IntArray, bool] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.piece = Piece(self.V, self.F)
@@ -144,14 +140,31 @@ class WorkingChart:
         """Mask (k,) of the triangles that are stretched beyond `WORST_STRETCH` although they are not thin."""
         return ~self._thin & (self.stretch > WORST_STRETCH)
 
+    @property
+    def crossings(self) -> IntArray:
+        """Pairs (c, 4) of boundary edges that intersect or almost touch."""
+        return self._find_contacts()[0]
+
+    @property
+    def bijective(self) -> bool:
+        """Whether the map covers no point twice, and its boundary stays away from itself; False without a map."""
+        return self._find_contacts()[1]
+
+    def _find_contacts(self) -> tuple[IntArray, bool]:
+        if self.uv is None or not self.stretch.size:
+            return np.empty((0, 4), dtype=np.int64), False
+        if self._contacts is None:
+            # Boundaries that are closer than this would touch in the precision of texture coordinates.
+            unit = _TUNING.gap * np.sqrt(self.piece.area)
+            crossings, reasons = check_loops(self.piece.loops, np.rint(self.uv / unit) * unit)
+            self._contacts = crossings, not reasons
+        return self._contacts
+
     def use(self, uv: FloatArray) -> None:
-        """Use an injective map (m, 2), scaled to the surface's area, and measure it."""
+        """Use an injective map (m, 2), scaled to the surface's area, and measure its stretch."""
         self.uv = self.piece.fit_scale(uv)
         self.stretch = measure_stretch(self.piece.energy(SymmetricDirichlet(), None), self.uv)
-        # Boundaries that are closer than this would touch in the precision of texture coordinates.
-        unit = _TUNING.gap * np.sqrt(self.piece.area)
-        self.crossings, reasons = check_loops(self.piece.loops, np.rint(self.uv / unit) * unit)
-        self.bijective = not reasons
+        self._contacts = None
 
 
 def smallest_angles(sides: ComplexArray) -> FloatArray:
@@ -193,7 +206,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
             return
     else:
         chart.use(chart.uv)
-        if chart.bijective and keeps_bound(chart, bound):
+        if keeps_bound(chart, bound) and chart.bijective:
             return
     _descend(chart, EvenStretch(bound), check_wanted)
 
@@ -277,6 +290,8 @@ def _relax_long(chart: WorkingChart, bound: float) -> None:
         return
     assert chart.uv is not None
     density = EvenStretch(bound)
-    moved = descend_on_patches(chart.piece.energy(density, None), density, chart.uv, chart.too_long, chart.linear_solver)
+    moved = descend_on_patches(
+        chart.piece.energy(density, None), density, chart.uv, chart.too_long, chart.linear_solver
+    )
     if moved is not None:
         chart.use(moved)

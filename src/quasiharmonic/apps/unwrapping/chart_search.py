@@ -304,7 +304,7 @@ def _improve(bound: float, workers: Workers, joinable: bool, job: _Job) -> tuple
         return parts, False
     if not job.divisible or len(chart.F) < 2:
         return [chart], True
-    parts = divide(chart, bound) if apart or not len(chart.crossings) else divide_overlap(chart)
+    parts = divide(chart, bound) if apart or not len(chart.crossings) else divide_overlap(chart, chart.crossings)
     if job.halved and len(parts) > 2:
         return [chart], True
     return [done for part in parts for done in _flatten(bound, workers, part)], False

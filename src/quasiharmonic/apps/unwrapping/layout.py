@@ -66,7 +66,6 @@ class ChartLayout:
         return np.where(self.mirrored[:, None], self.rows[:, ::-1], self.rows)
 
 
-
 class Divide(Protocol):
     """Divide long charts, given positions (n, 3), costs (f, 3) and textures (f,); see `divide_long_charts`."""
 

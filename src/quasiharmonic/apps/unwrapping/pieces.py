@@ -251,9 +251,9 @@ def find_pieces(
     for angle in (CREASE, *np.deg2rad(_TUNING.angles), 0.0):
         heartbeat()
         rest = (found.label < 0) & ~torus
-        if 0 < angle < CREASE and np.count_nonzero(rest) > _TUNING.many_triangles:
-            if area[rest & flat].sum() < _TUNING.min_share:
-                continue
+        many = np.count_nonzero(rest) > _TUNING.many_triangles
+        if 0 < angle < CREASE and many and area[rest & flat].sum() < _TUNING.min_share:
+            continue
         within = ~apart & rest[hinges.first] & rest[hinges.second]
         # What is left between pieces can be developable as a whole, with its creases.
         joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat | together) if angle else within

@@ -17,7 +17,7 @@ _TOLERANCE = 1e-6
 _AXES = "xyz"
 # A smaller share of mirror images is due to chance.
 _WORTH_REPORTING = 0.9
-# Of about so many vertices, all over a model, this share may lack an image; otherwise the model is not examined further.
+# Of about so many vertices, all over a model, this share may lack an image; otherwise the others are not examined.
 _SAMPLES, _MOST_WITHOUT = 500, 0.5
 
 
@@ -27,7 +27,8 @@ class Symmetry(NamedTuple):
     Attributes
     ----------
     axis : str or None
-        Axis normal to the plane with most mirror images; None if no plane was sought.
+        Axis normal to the plane with most mirror images; None if no plane was sought, or ``"auto"`` found none with
+        many.
     share : float
         Share of the vertices that have a mirror image, to 1e-6 of the diagonal of the model's box.
     applied : bool

@@ -34,9 +34,9 @@ class BitmapTuning(NamedTuple):
     """Numbers that tune the boards; charts are few up to `MANY`, and many above."""
 
     # Expected number of cells along a tile for few charts.
-    cells: int = 112
+    cells: int = 128
     # The same on the finer board, which is for the final layout of few charts.
-    fine_cells: int = 320
+    fine_cells: int = 384
     # Number of few charts on a tile from which cells are proportionally smaller.
     charts_per_tile: int = 36
     # Expected number of cells along a tile for many charts.

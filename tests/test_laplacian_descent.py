@@ -1,0 +1,108 @@
+"""Quasi-Newton descents with a Laplacian as metric."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quasiharmonic.apps.flattening.piece import Piece
+from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
+from quasiharmonic.energies.energies import MIPS, Hardened, SymmetricDirichlet
+from quasiharmonic.energies.newton.laplacian_descent import LaplacianDescent
+from quasiharmonic.geometry.exact.certificate import is_injective
+from shared.meshes import irregular_disk, lift
+
+
+def bowl(n=300, seed=3):
+    """A piece of a curved surface, and an injective map of it with moderate distortion."""
+    V, F = irregular_disk(n, seed)
+    return Piece(lift(V), F), V * [1.2, 0.9]
+
+
+def minimum(energy, uv):
+    """Lowest energy by Newton's method."""
+    descent = SurfaceDescent(energy, uv, "auto")
+    for _ in descent.descend(100, 1e-10):
+        pass
+    return descent.distortion
+
+
+@pytest.mark.parametrize("density", [SymmetricDirichlet(), Hardened(SymmetricDirichlet(), 0.5), MIPS()])
+def test_the_minimum_is_newton_s(density):
+    piece, uv = bowl()
+    energy = piece.energy(density, None)
+    descent = LaplacianDescent(energy, piece.fit_scale(uv))
+    before = descent.value
+    for steps in range(1, 200):
+        value = descent.value
+        if not descent.step() or not descent.value < (1 - 1e-9) * value:
+            break
+        assert descent.value < value
+        assert is_injective(piece.F, descent.uv)
+    lowest = minimum(energy, piece.fit_scale(uv))
+    assert descent.value == pytest.approx(lowest, rel=1e-5, abs=1e-9)
+    # Steepest descent in the metric alone takes hundreds of steps.
+    assert steps < 100
+    assert before > 1.2 * lowest
+
+
+def two_loops(inverse, steps, changes, gradient):
+    """L-BFGS's direction by its usual recursion, with the inverse metric as a matrix."""
+    r, factors = gradient.copy(), []
+    for s, y in zip(reversed(steps), reversed(changes), strict=True):
+        factors.append(s @ r / (s @ y))
+        r -= factors[-1] * y
+    z = inverse @ r
+    for s, y, factor in zip(steps, changes, reversed(factors), strict=True):
+        z += (factor - y @ z / (s @ y)) * s
+    return -z
+
+
+def test_directions_are_those_of_the_recursion():
+    piece, uv = bowl(120)
+    energy = piece.energy(Hardened(SymmetricDirichlet(), 0.5), None)
+    near = LaplacianDescent(energy, piece.fit_scale(uv))
+    for _ in range(20):
+        near.step()
+    # So near that the energy does not halve, which would change the metric.
+    descent = LaplacianDescent(energy, 0.8 * near.uv + 0.2 * piece.fit_scale(uv))
+    w = descent.uv @ [1, 1j]
+    n, first = len(w), descent.value
+    form = energy.curvature_of(energy.deform(w))
+    weight = 0.5 * (form.pp + form.qq)
+    stiffness = np.zeros((n, n))
+    for k in range(3):
+        i, j = piece.F[:, k], piece.F[:, (k + 1) % 3]
+        entry = 2 * weight * (energy.g[k] * energy.g[(k + 1) % 3].conj()).real
+        np.add.at(stiffness, (i, j), entry)
+        np.add.at(stiffness, (j, i), entry)
+    stiffness -= np.diag(stiffness.sum(axis=1))
+    inverse = np.zeros((n, n))
+    inverse[1:, 1:] = np.linalg.inv(stiffness[1:, 1:])
+    inverse = np.kron(inverse, np.eye(2))
+    steps, changes, gradient = [], [], energy.gradient(w).view(np.float64)
+    while descent.step() and descent.value > 0.5 * first and len(steps) < 6:
+        there = descent.uv @ [1, 1j]
+        step, new = (there - w).view(np.float64), energy.gradient(there).view(np.float64)
+        expected = two_loops(inverse, steps, changes, gradient)
+        np.testing.assert_allclose(
+            step / np.linalg.norm(step), expected / np.linalg.norm(expected), atol=1e-7 * np.sqrt(n)
+        )
+        steps.append(step)
+        changes.append(new - gradient)
+        w, gradient = there, new
+    assert len(steps) >= 3
+
+
+def test_rotations_of_the_start_do_not_matter():
+    piece, uv = bowl()
+    energy = piece.energy(SymmetricDirichlet(), None)
+    uv = piece.fit_scale(uv)
+    turned = uv @ np.array([[0.6, 0.8], [-0.8, 0.6]])
+    found = []
+    for start in (uv, turned):
+        descent = LaplacianDescent(energy, start)
+        for _ in range(5):
+            descent.step()
+        found.append(descent.value)
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
