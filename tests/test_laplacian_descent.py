@@ -33,16 +33,15 @@ def test_the_minimum_is_newton_s(density):
     energy = piece.energy(density, None)
     descent = LaplacianDescent(energy, piece.fit_scale(uv))
     before = descent.value
-    for steps in range(1, 200):
+    # Steepest descent in the metric alone takes hundreds of steps.
+    for _ in range(100):
         value = descent.value
-        if not descent.step() or not descent.value < (1 - 1e-9) * value:
+        if not descent.step():
             break
         assert descent.value < value
         assert is_injective(piece.F, descent.uv)
     lowest = minimum(energy, piece.fit_scale(uv))
     assert descent.value == pytest.approx(lowest, rel=1e-5, abs=1e-9)
-    # Steepest descent in the metric alone takes hundreds of steps.
-    assert steps < 100
     assert before > 1.2 * lowest
 
 

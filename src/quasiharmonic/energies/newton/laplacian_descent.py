@@ -1,13 +1,13 @@
 """Quasi-Newton descent near a minimum, by systems with one unknown per vertex.
 
 A Newton system has two unknowns per vertex, so its factor takes about eight times the time of a Laplacian's. Each step
-here solves with a Laplacian whose weights are the mean second derivatives of the energy on each triangle. The changes of
-the gradient in the last steps correct the direction (L-BFGS with the Laplacian as metric [1]_). Such a step takes a
-tenth of the time of Newton's near the minimum, where two or three times as many are needed. Far from it, Newton's are
-better.
+here solves with a Laplacian whose weights are the mean second derivatives of the energy on each triangle. The last
+steps and the changes of the gradient correct the direction (L-BFGS with the Laplacian as metric [1]_). Near the
+minimum, two or three times as many steps are needed as with Newton's method, and each takes a tenth of the time. Far
+from the minimum, Newton's method is faster.
 
-With ``H₀`` the inverse of the Laplacian, S and Y the columns of the last displacements and of the changes of the
-gradient, ``R`` the upper triangle of ``SᵀY`` and D its diagonal, the inverse second derivative is approximated by [2]_
+Let H₀ be the inverse of the Laplacian. The columns of S are the last displacements, those of Y the changes of the
+gradient. R is the upper triangle of ``SᵀY``, and D its diagonal. The inverse second derivative is then about [2]_
 
 ::
 
