@@ -8,12 +8,18 @@ import pytest
 from quasiharmonic import unwrap
 from quasiharmonic.apps.unwrapping.chart_search import Workers
 from quasiharmonic.apps.unwrapping.coarse_search import CoarseSearch, cut_into_charts
+from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.splitting import split_parts
 from quasiharmonic.surfaces import starfish
 from quasiharmonic.targets.cuts.shortening import cut_by_levels
 from shared.hinges import stretches
 
 V, F = starfish(5, 30)  # 5,402 vertices, more than the search takes at once
+
+
+def keep_all(charts, points, cost, unit):
+    """Divide no chart."""
+    return charts
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +60,7 @@ def test_seams_and_charts_that_are_demanded_need_no_coarse_search(result):
 @pytest.mark.long
 def test_a_coarse_mesh_that_is_large_is_searched_on_a_coarser_one():
     W, T = starfish(5, 60)
-    search, sizes = CoarseSearch(1.5, 0.1, Workers(1, None), W), []
+    search, sizes = CoarseSearch(1.5, 0.1, Workers(1, None), W, keep_all), []
 
     def find(graph, vertices, rounds):
         sizes.append(graph.n)
@@ -73,7 +79,24 @@ def test_a_surface_without_interior_vertices_has_no_coarser_mesh():
     W = np.concatenate([side, side + np.array([0, 0, 0.02])])
     one, other = k[:-1], k[:-1] + len(k)
     T = np.concatenate([np.stack([one, one + 1, other], axis=1), np.stack([one + 1, other + 1, other], axis=1)])
-    (chart,) = cut_into_charts(
-        W, T, np.empty((0, 2), dtype=np.int64), np.ones(T.shape), 0.1, CoarseSearch(1.5, 0.1, Workers(1, None), W)
-    )
+    search = CoarseSearch(1.5, 0.1, Workers(1, None), W, keep_all)
+    (chart,) = cut_into_charts(W, T, np.empty((0, 2), dtype=np.int64), np.ones(T.shape), 0.1, search)
     assert len(chart.F) == len(T)
+
+
+def test_charts_are_divided_on_the_coarse_mesh():
+    """The divided charts have the area of the surface in its unit, and their seams are carried to the surface."""
+    W, T = 100 * V, F
+
+    def halve(charts, points, cost, unit):
+        areas.append(unit**2 * sum(chart.shape.area for chart in charts))
+        return [part for chart in charts for part in chart.split(np.arange(len(chart.F)) < len(chart.F) // 2)]
+
+    counts, areas = [], list[float]()
+    for divide in (keep_all, halve):
+        search = CoarseSearch(1.5, 0.1, Workers(1, None), W, divide)
+        charts = cut_into_charts(W, T, np.empty((0, 2), dtype=np.int64), np.ones(T.shape), 0.1, search)
+        counts.append(len(charts))
+    assert counts[1] >= 2 * counts[0]
+    # The coarse mesh is a little smaller than the surface.
+    assert 0.9 < areas[0] / surface_area(W, T) < 1.01
