@@ -47,9 +47,9 @@ class FitTuning(NamedTuple):
     """Numbers that tune the fits of maps to rotated triangles, and their repair."""
 
     # Number of further fits to rotated triangles, after the first one. Later fits permit some stretch.
-    rotated_fits: int = 4
+    rotated_fits: int = 3
     # Least number of further fits, after which they stop when the aim is reached.
-    least_fits: int = 6
+    least_fits: int = 5
     # The aim counts as reached if at most this part of the free share exceeds it: repairs may stretch a little more.
     enough: float = 0.5
     # Largest number of further fits.
