@@ -47,7 +47,7 @@ R = TypeVar("R")
 Callback = Callable[[str, int, int], object]
 
 #: The aim for charts of a coarse mesh, whose seams are carried to the surface: this fraction of the permitted stretch.
-AIM_OF_CARRIED = 0.8
+AIM_OF_CARRIED = 0.75
 # Seconds between two calls of the callback while nothing is finished.
 _TICK = 0.25
 # Two sides of a cut lie at the same place if their ends are at most this fraction of their length apart.
