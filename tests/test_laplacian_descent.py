@@ -1,4 +1,4 @@
-"""Quasi-Newton descents with a Laplacian as metric."""
+"""Quasi-Newton descents with a Laplacian as metric, and the thin triangles that they leave stretched."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
+from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart, relax_thin
 from quasiharmonic.energies.energies import MIPS, Hardened, SymmetricDirichlet
 from quasiharmonic.energies.newton.laplacian_descent import LaplacianDescent
 from quasiharmonic.geometry.exact.certificate import is_injective
@@ -105,3 +106,42 @@ def test_rotations_of_the_start_do_not_matter():
             descent.step()
         found.append(descent.value)
     assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
+def chart_with_sliver(height):
+    """A disk; a vertex very close to an edge makes a thin triangle, which the map stretches along the edge."""
+    V, F = irregular_disk(200, 5)
+    inner = F[np.argmin(np.abs(V[F].mean(axis=1)).sum(axis=1))]
+    a, b, c = V[inner]
+    near = a + 0.5 * (b - a) + height * (c - a)
+    k = len(V)
+    i, j, m = inner.tolist()
+    others = F[(inner != F).any(axis=1)]
+    T = np.concatenate([others, [[i, j, k], [j, m, k], [m, i, k]]])
+    P = np.concatenate([V, [near]])
+    chart = WorkingChart(np.arange(len(T)), np.arange(k + 1), np.pad(P, [(0, 0), (0, 1)]), T, np.ones(T.shape))
+    moved = P.copy()
+    # Twenty times as high as it should be.
+    moved[k] = a + 0.5 * (b - a) + 20 * height * (c - a)
+    chart.use(moved)
+    return chart, len(T) - 3
+
+
+def test_thin_triangles_do_not_stay_stretched():
+    chart, thin = chart_with_sliver(2e-3)
+    before = chart.stretch.copy()
+    assert before[thin] > 10
+    assert not chart.too_long[thin]
+    relax_thin(chart, 1.5)
+    assert chart.stretch[thin] < 2
+    assert chart.bijective
+    assert chart.share_over(1.5) <= (chart.area * (before > 1.5)).sum()
+
+
+def test_a_chart_without_stretched_triangles_keeps_its_map():
+    chart, _ = chart_with_sliver(0.2)
+    chart.use(np.delete(chart.V, 2, axis=1))
+    before = chart.uv.copy()
+    assert chart.stretch.max() < 3
+    relax_thin(chart, 1.5)
+    np.testing.assert_array_equal(chart.uv, before)

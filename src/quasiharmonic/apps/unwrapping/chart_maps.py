@@ -286,12 +286,25 @@ def _relax_long(chart: WorkingChart, bound: float) -> None:
 
     Without effect where too much of the chart exceeds the bound, so that all of the map must change.
     """
-    if not chart.too_long.any() or chart.share_over(bound) > FREE_SHARE:
+    if chart.too_long.any() and chart.share_over(bound) <= FREE_SHARE:
+        _relax(chart, bound, chart.too_long)
+
+
+def relax_thin(chart: WorkingChart, bound: float) -> None:
+    """Lower the stretch around thin triangles that quasi-Newton steps leave stretched, if the map stays bijective."""
+    before = chart.uv
+    if before is None or not chart.bijective or not chart.over(WORST_STRETCH).any():
         return
+    share, worst = chart.share_over(bound), float(chart.stretch.max())
+    _relax(chart, bound, chart.over(WORST_STRETCH))
+    if not chart.bijective or chart.too_long.any() or chart.share_over(bound) > share or chart.stretch.max() > worst:
+        chart.use(before)
+
+
+def _relax(chart: WorkingChart, bound: float, long: BoolArray) -> None:
+    """Lower the stretch around some triangles (k,), with the rest of the map fixed."""
     assert chart.uv is not None
     density = EvenStretch(bound)
-    moved = descend_on_patches(
-        chart.piece.energy(density, None), density, chart.uv, chart.too_long, chart.linear_solver
-    )
+    moved = descend_on_patches(chart.piece.energy(density, None), density, chart.uv, long, chart.linear_solver)
     if moved is not None:
         chart.use(moved)

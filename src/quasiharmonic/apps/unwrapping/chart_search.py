@@ -30,6 +30,7 @@ from quasiharmonic.apps.unwrapping.chart_maps import (
     WorkingChart,
     flatten_chart,
     guard_chart,
+    relax_thin,
 )
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST
 from quasiharmonic.apps.unwrapping.separation import overlapping_share, separate
@@ -197,6 +198,7 @@ def search_charts(
     keep(here)
     overlapping = [chart for chart in here if not chart.bijective]
     workers.map("separate", partial(guard_chart, check_wanted=workers.check_wanted), overlapping)
+    workers.map("improve", partial(relax_thin, bound=bound), here)
     if not joinable:
         return here
     return move_teeth(join_small_charts(here, aim, total_area, workers.check_wanted), aim)
