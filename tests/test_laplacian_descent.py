@@ -7,10 +7,11 @@ import pytest
 
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent
-from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart, relax_thin
+from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart, flatten_chart, relax_thin
 from quasiharmonic.energies.energies import MIPS, Hardened, SymmetricDirichlet
 from quasiharmonic.energies.newton.laplacian_descent import LaplacianDescent
 from quasiharmonic.geometry.exact.certificate import is_injective
+from quasiharmonic.linsolve import NotPositiveDefinite
 from shared.meshes import irregular_disk, lift
 
 
@@ -145,3 +146,18 @@ def test_a_chart_without_stretched_triangles_keeps_its_map():
     assert chart.stretch.max() < 3
     relax_thin(chart, 1.5)
     np.testing.assert_array_equal(chart.uv, before)
+
+
+def test_newton_s_method_takes_over_where_the_laplacian_has_no_factor(monkeypatch):
+    def fail(self):
+        raise NotPositiveDefinite("the matrix is not positive definite")
+
+    V, F = irregular_disk(200, 5)
+    chart = WorkingChart(np.arange(len(F)), np.arange(len(V)), 3 * lift(V), F, np.ones(F.shape))
+    flatten_chart(chart, 1.3, lambda: None)
+    expected = chart.stretch
+    monkeypatch.setattr(LaplacianDescent, "step", fail)
+    chart.uv = None
+    flatten_chart(chart, 1.3, lambda: None)
+    assert is_injective(F, chart.uv)
+    assert np.quantile(chart.stretch, 0.99) < 1.1 * np.quantile(expected, 0.99)

@@ -26,7 +26,7 @@ from quasiharmonic.energies.newton.laplacian_descent import LaplacianDescent
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
-from quasiharmonic.linsolve import available
+from quasiharmonic.linsolve import NotPositiveDefinite, available
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from quasiharmonic.util.options import FlattenOptions
 
@@ -133,7 +133,7 @@ class WorkingChart:
     @property
     def linear_solver(self) -> str:
         """The linear solver for systems of the chart: charts are narrow, so small ones have little fill."""
-        return available(0)[0] if len(self.V) <= _TUNING.narrow else "auto"
+        return "qdldl" if len(self.V) <= _TUNING.narrow and available(0)[0] == "qdldl" else "auto"
 
     @property
     def too_long(self) -> BoolArray:
@@ -240,27 +240,30 @@ def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], ob
     """Lower an energy of the chart's map, which stays injective."""
     assert chart.uv is not None
     try:
-        if _approach(chart, density, check_wanted):
+        if _approach(chart, density, _TUNING.near, check_wanted):
             _finish(chart, density, check_wanted)
+    except NotPositiveDefinite:
+        # Newton's system can be made positive definite where rounding prevents that for the Laplacian.
+        _approach(chart, density, _TUNING.nothing, check_wanted)
     finally:
         # After a time limit, the chart has the map so far.
         chart.use(chart.uv)
 
 
-def _approach(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> bool:
-    """Take Newton's steps until the map is near the minimum; return False if they end before."""
+def _approach(chart: WorkingChart, density: Energy, near: float, check_wanted: Callable[[], object]) -> bool:
+    """Take Newton's steps until the mean energy is at most ``near``; return False if they become slow before."""
     assert chart.uv is not None
     energy = chart.piece.energy(density, None)
     before = energy.value(in_units(chart.uv, 0))
-    if before <= _TUNING.near:
+    if before <= near:
         return True
-    if isinstance(density, SymmetricDirichlet):
+    if isinstance(density, SymmetricDirichlet) and before > _TUNING.near:
         energy = energy.with_density(ReweightedDirichlet())
     descent = SurfaceDescent(energy, chart.uv, chart.linear_solver)
     for _ in itertools.islice(descend(descent, density, _TUNING.tolerance), _TUNING.max_steps):
         chart.uv = descent.uv
         check_wanted()
-        if descent.distortion <= _TUNING.near:
+        if descent.distortion <= near:
             return True
         if descent.distortion > (1 - _TUNING.slow) * before:
             return False

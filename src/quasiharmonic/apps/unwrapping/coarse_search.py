@@ -1,13 +1,12 @@
 """Charts of a large surface from those of a coarse mesh: their seams, and initial maps close to the final ones.
 
 Coarse charts that are too long for the texture are divided. The seams of all charts are then carried to the surface and
-shortened there. A vertex in the interior of a
-coarse chart keeps its position in that chart's map, and so do vertices that are inserted between such vertices. They
-give the rotations of their triangles. The triangles near seams get theirs by unfolding from their neighbours. The map
-is fitted to the rotated triangles [1]_, then to the nearest ones that are stretched little, which is repeated. All
-systems have one unknown per vertex and the same matrix. Triangles that collapse or invert meanwhile are rotated anew,
-as their neighbours unfold. The surroundings of the few triangles that stay inverted are mapped by `injective_map`. A
-map whose boundary meets itself at more than a few places is not used.
+shortened there. A vertex in the interior of a coarse chart keeps its position in that chart's map, and so do vertices
+that are inserted between such vertices. They give the rotations of their triangles. The triangles near seams get theirs
+by unfolding from their neighbours. The map is fitted to the rotated triangles [1]_, then to the nearest ones that are
+stretched little, which is repeated. All systems have one unknown per vertex and the same matrix. Triangles that
+collapse or invert meanwhile are rotated anew, as their neighbours unfold. The surroundings of the few triangles that
+stay inverted are mapped by `injective_map`. A map whose boundary meets itself at more than a few places is not used.
 
 The coarse mesh of a huge surface is large, and searched in the same way on a coarser one.
 
