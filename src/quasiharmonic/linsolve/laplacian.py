@@ -196,6 +196,14 @@ def embed_tutte(
     return Laplacian(F, len(w), fixed, linear_solver).factor(stiffness).extend(w)
 
 
+def weigh_edges(g: ComplexArray, weight: FloatArray) -> FloatArray:
+    """Return the stiffness (3, f) of the half-edges where the tensor of each triangle is a multiple of the identity.
+
+    ``g`` (3, f) are the gradients at the corners, up to a factor, and ``weight`` (f,) the multiples times the areas.
+    """
+    return np.asarray(2 * weight * (g * g[(1, 2, 0), :].conj()).real)
+
+
 @compiled
 def assemble(
     stiffness: FloatArray,

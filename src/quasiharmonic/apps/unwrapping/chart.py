@@ -211,6 +211,11 @@ def group_charts(charts: Sequence[Chart], texture: IntArray) -> list[list[Chart]
     return [group for k, group in sorted(groups.items()) if k >= 0]
 
 
+def measure_fullest(charts: Sequence[Chart], texture: IntArray) -> float:
+    """Return the area of the charts of the texture that has most of it; see `group_charts`."""
+    return max(map(measure_charts, group_charts(charts, texture)), default=0.0)
+
+
 def measure_charts(charts: Sequence[Chart]) -> float:
     """Return the area of charts in the plane."""
     return sum(chart.shape.area for chart in charts)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.chart import Chart, group_charts, halve, measure_charts
+from quasiharmonic.apps.unwrapping.chart import Chart, halve, measure_fullest
 from quasiharmonic.apps.unwrapping.chart_cuts import divide, divide_overlap, group_undivided, is_undivided
 from quasiharmonic.apps.unwrapping.chart_maps import WORST_STRETCH
 from quasiharmonic.apps.unwrapping.hinges import UNDIVIDED_COST
@@ -100,7 +100,7 @@ def divide_long_charts(
     """
     for_packing = wanted.divide_for_packing
     if area is None:
-        area = max(map(measure_charts, group_charts(charts, texture)), default=0.0)
+        area = measure_fullest(charts, texture)
     ratio = max(size) / min(size)
     side = float(np.sqrt(area * ratio / (_TUNING.expected_use * wanted.tiles)))
     longest_flat = _TUNING.longest_flat * side

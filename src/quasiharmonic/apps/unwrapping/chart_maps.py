@@ -1,8 +1,9 @@
 """Flatten one chart with a free boundary, and measure its stretch.
 
 The symmetric Dirichlet energy is a mean, so it accepts much stretch in few triangles. If more of the chart than allowed
-is stretched beyond the bound, the descent continues with `EvenStretch`, which weights large stretch more. The boundary
-is not guarded against overlaps. A chart that overlaps itself is divided by the caller, which also lowers its stretch.
+is stretched beyond the bound, the descent continues with `EvenStretch`, which weights large stretch more. Both take
+Newton's steps far from the minimum, and quasi-Newton steps near it. The boundary is not guarded against overlaps. A
+chart that overlaps itself is divided by the caller, which also lowers its stretch.
 """
 
 from __future__ import annotations

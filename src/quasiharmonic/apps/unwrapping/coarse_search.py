@@ -5,7 +5,7 @@ shortened there. A vertex in the interior of a coarse chart keeps its position i
 that are inserted between such vertices. They give the rotations of their triangles. The triangles near seams get theirs
 by unfolding from their neighbours. The map is fitted to the rotated triangles [1]_, then to the nearest ones that are
 stretched little, which is repeated. All systems have one unknown per vertex and the same matrix. Triangles that
-collapse or invert meanwhile are rotated anew, as their neighbours unfold. The surroundings of the few triangles that
+collapse or invert meanwhile are rotated again, as their neighbours unfold. The surroundings of the few triangles that
 stay inverted are mapped by `injective_map`. A map whose boundary meets itself at more than a few places is not used.
 
 The coarse mesh of a huge surface is large, and searched in the same way on a coarser one.
@@ -36,7 +36,7 @@ from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.splitting import split_parts
 from quasiharmonic.geometry.mesh.topology import boundary_edges, find_pairs
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.linsolve.laplacian import Laplacian, weigh_edges
 from quasiharmonic.targets.cuts.find import find_cuts_by
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at, to_complex, to_points
@@ -188,7 +188,7 @@ def _fit(
         return None
     # Up to a factor, which all terms have.
     area = 1 / np.abs((g[1].conj() * g[2]).imag)
-    fitted = Laplacian(F, n, np.array([0])).factor(2 * area * (g * g[(1, 2, 0), :].conj()).real)
+    fitted = Laplacian(F, n, np.array([0])).factor(weigh_edges(g, area))
     w = fitted.respond(sum_at(corners.ravel(), (area * turned * g).ravel(), n))
     most = 1 + _TUNING.permitted * (aim - 1)
     for k in range(_TUNING.most_fits + 1):

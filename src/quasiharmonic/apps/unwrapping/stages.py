@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from quasiharmonic.apps.atlas.packing.bitmap_search import BITMAPS, MANY, Textures
 from quasiharmonic.apps.atlas.packing.pack import Packing
-from quasiharmonic.apps.unwrapping.chart import Chart, find_textures, group_charts, measure_charts, number_kinds
+from quasiharmonic.apps.unwrapping.chart import Chart, find_textures, measure_fullest, number_kinds
 from quasiharmonic.apps.unwrapping.chart_fitting import divide_fragile, divide_long_charts, mend_charts
 from quasiharmonic.apps.unwrapping.chart_maps import THIN_ANGLE, WORST_STRETCH, smallest_angles
 from quasiharmonic.apps.unwrapping.chart_verdict import UnwrapCertificate, certify_charts
@@ -212,8 +212,7 @@ def _find_charts(task: Task, draft: Draft) -> list[Chart]:
     # With kept charts, it is unknown how long new ones may be.
     if density is None or task.kept is not None or task.rules.uv is not None:
         return charts
-    area = max(map(measure_charts, group_charts(charts, task.texture)), default=0.0)
-    if area * density**2 > task.into.texels:
+    if measure_fullest(charts, task.texture) * density**2 > task.into.texels:
         # Shorter charts would not fit either.
         return charts
     divided = _make_divide(task, density)(charts, task.points, task.rules.cost, task.texture)

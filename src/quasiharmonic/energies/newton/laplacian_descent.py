@@ -34,7 +34,7 @@ from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.newton.line_search import backtrack, extend
 from quasiharmonic.energies.newton.map_model import FRACTION, HALVINGS, NewtonState, in_units, out_of_units
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.linsolve.laplacian import FactoredLaplacian, Laplacian
+from quasiharmonic.linsolve.laplacian import FactoredLaplacian, Laplacian, weigh_edges
 from quasiharmonic.util.arrays import ComplexArray, FloatArray
 
 
@@ -43,7 +43,7 @@ class MetricTuning(NamedTuple):
 
     # Number of earlier steps that correct the direction.
     memory: int = 8
-    # The Laplacian is computed anew when the energy has fallen to this fraction.
+    # The Laplacian is computed again when the energy has fallen to this fraction.
     fallen: float = 0.5
     # Smallest weight of a triangle, relative to the largest.
     least_weight: float = 1e-12
@@ -66,7 +66,6 @@ class LaplacianDescent:
     def __init__(self, energy: DeformationEnergy, uv: FloatArray, linear_solver: str = "auto") -> None:
         self.energy = energy
         self._laplacian = Laplacian(energy.F, len(uv), np.array([0]), linear_solver)
-        self._cotangents = 2 * (energy.g * energy.g[(1, 2, 0), :].conj()).real
         w = in_units(uv, 0)
         self._state = self._evaluate(w)
         self._gradient = energy.gradient_of(self._state.derivatives, w.size)
@@ -121,11 +120,11 @@ class LaplacianDescent:
         return NewtonState(w, derivatives, self.energy.value_of(derivatives))
 
     def _measure(self) -> None:
-        """Factor the Laplacian at the current map, and forget earlier steps."""
+        """Factor the Laplacian at the current map, and drop the earlier steps."""
         form = self.energy.curvature_of(self._state.derivatives)
         weight = 0.5 * (form.pp + form.qq)
         weight = np.maximum(weight, _TUNING.least_weight * weight.max())
-        self._metric = self._laplacian.factor(weight * self._cotangents)
+        self._metric = self._laplacian.factor(weigh_edges(self.energy.g, weight))
         self._measured_at = self._state.value
         self._memory = self._memory[:, :0]
         self._answer = self._metric.respond(self._gradient).view(np.float64)

@@ -32,7 +32,7 @@ import numpy as np
 from quasiharmonic.energies.deformation import pulls
 from quasiharmonic.energies.energies import Deformation
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.linsolve.laplacian import Laplacian
+from quasiharmonic.linsolve.laplacian import Laplacian, weigh_edges
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, sum_at
 from quasiharmonic.util.progress import heartbeat
 
@@ -154,8 +154,7 @@ class RotationPath:
         self._g = g
         # The cross product of the gradients gives the area up to a common factor.
         self._area: FloatArray = 1 / np.abs((g[1].conj() * g[2]).imag)
-        stiffness = 2 * self._area * (g * g[(1, 2, 0), :].conj()).real
-        self._laplacian = Laplacian(F, n, fixed, linear_solver).factor(stiffness)
+        self._laplacian = Laplacian(F, n, fixed, linear_solver).factor(weigh_edges(g, self._area))
 
     @cached_property
     def _corners(self) -> IntArray:

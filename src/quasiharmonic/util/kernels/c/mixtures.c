@@ -121,22 +121,6 @@ static void add_slopes(const double *mixture, const Squares *d, Slopes *slopes)
         }
 }
 
-static void take_slopes(const double *mixture, const Squares *d, Slopes *slopes)
-{
-    const double k = mixture[CUBE];
-    memset(slopes, 0, sizeof *slopes);
-    add_slopes(mixture, d, slopes);
-    if (k == 0)
-        return;
-    double density[CHUNK] = {0};
-    add_densities(mixture, d, density);
-    for (Py_ssize_t j = 0; j < d->size; j++) {
-        const double factor = 1 + 3 * k * (density[j] * density[j]);
-        slopes->a[j] *= factor;
-        slopes->b[j] *= factor;
-    }
-}
-
 static void add_bends(const double *mixture, const Squares *d, Bends *bends)
 {
     const Py_ssize_t size = d->size;
@@ -175,23 +159,30 @@ static void add_bends(const double *mixture, const Squares *d, Bends *bends)
         }
 }
 
-static void take_bends(const double *mixture, const Squares *d, Bends *bends)
+/* The first derivatives, and the second ones unless `bends` is NULL. */
+static void take_derivatives(const double *mixture, const Squares *d, Slopes *slopes, Bends *bends)
 {
     const double k = mixture[CUBE];
-    memset(bends, 0, sizeof *bends);
-    add_bends(mixture, d, bends);
+    memset(slopes, 0, sizeof *slopes);
+    add_slopes(mixture, d, slopes);
+    if (bends) {
+        memset(bends, 0, sizeof *bends);
+        add_bends(mixture, d, bends);
+    }
     if (k == 0)
         return;
     double density[CHUNK] = {0};
-    Slopes slopes = {{0}, {0}};
     add_densities(mixture, d, density);
-    add_slopes(mixture, d, &slopes);
     for (Py_ssize_t j = 0; j < d->size; j++) {
         const double e = density[j], factor = 1 + 3 * k * (e * e), square = 6 * k * e;
-        const double by_a = slopes.a[j], by_b = slopes.b[j];
-        bends->aa[j] = factor * bends->aa[j] + square * (by_a * by_a);
-        bends->ab[j] = factor * bends->ab[j] + square * (by_a * by_b);
-        bends->bb[j] = factor * bends->bb[j] + square * (by_b * by_b);
+        const double by_a = slopes->a[j], by_b = slopes->b[j];
+        slopes->a[j] *= factor;
+        slopes->b[j] *= factor;
+        if (bends) {
+            bends->aa[j] = factor * bends->aa[j] + square * (by_a * by_a);
+            bends->ab[j] = factor * bends->ab[j] + square * (by_a * by_b);
+            bends->bb[j] = factor * bends->bb[j] + square * (by_b * by_b);
+        }
     }
 }
 
@@ -250,7 +241,7 @@ static PyObject *mixed_slopes(PyObject *module, PyObject *const *given, Py_ssize
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t start = 0; start < f; start += CHUNK) {
         take_squares(p, q, arguments[3].data, start, f, &d);
-        take_slopes(arguments[0].data, &d, &slopes);
+        take_derivatives(arguments[0].data, &d, &slopes, NULL);
         for (Py_ssize_t j = 0; j < d.size; j++) {
             const Py_ssize_t x = 2 * (start + j), y = x + 1;
             const double to_p = 2 * slopes.a[j], to_q = 2 * slopes.b[j];
@@ -329,8 +320,7 @@ static PyObject *mixed_curvature(PyObject *module, PyObject *const *given, Py_ss
     Py_BEGIN_ALLOW_THREADS
     for (Py_ssize_t start = 0; start < f; start += CHUNK) {
         take_squares(p, q, arguments[3].data, start, f, &d);
-        take_slopes(mixture, &d, &slopes);
-        take_bends(mixture, &d, &bends);
+        take_derivatives(mixture, &d, &slopes, &bends);
         filter(&d, &slopes, &bends, share + start, arguments[5].number, &kept);
         for (Py_ssize_t j = 0; j < d.size; j++) {
             const Py_ssize_t x = 2 * (start + j), y = x + 1;
