@@ -186,10 +186,16 @@ def list_others(n: int, chosen: IntArray) -> IntArray:
 
 def first_equal(rows: NDArray[Any]) -> IntArray:
     """Index (k,) int64 of the first row that is equal to each row of (k, d)."""
-    order = np.lexsort(rows.T)
-    starts = np.ones(len(rows), dtype=bool)
+    first = np.arange(len(rows))
+    if not len(rows):
+        return first
+    order = np.argsort(rows[:, 0])
+    # Most rows differ from all others in their first number.
+    equal = rows[order[1:], 0] == rows[order[:-1], 0]
+    some = np.sort(order[np.append(equal, False) | np.append(False, equal)])
+    order = some[np.lexsort(rows[some].T)]
+    starts = np.ones(order.size, dtype=bool)
     starts[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
-    first = np.empty(len(rows), dtype=np.int64)
     first[order] = order[starts][np.cumsum(starts) - 1]
     return first
 

@@ -10,6 +10,7 @@ import numpy as np
 from quasiharmonic import boundary_loops
 from quasiharmonic.apps.atlas.packing.board import list_runs
 from quasiharmonic.geometry.coarsening import allocate_round, remove_vertices
+from quasiharmonic.geometry.mesh.topology import find_sides
 from quasiharmonic.surfaces import annulus, disk
 from quasiharmonic.targets.cuts.graph import edge_graph
 from shared.kernel_arguments.registry import ARGUMENTS, Arguments, arguments_of, numbers, soup
@@ -59,6 +60,17 @@ def _(rng):
 @arguments_of("number_sides")
 def _(rng):
     return soup(rng, 9, 5), 4, np.zeros((5, 3), dtype=np.int64), np.zeros((15, 2), dtype=np.int64)
+
+
+def paired_sides(rng: np.random.Generator, triangles: int, edges: int | None = None) -> Arguments:
+    """Sides of random triangles, many of which share an edge."""
+    ends, side = find_sides(soup(rng, 9, triangles), 9)
+    return side, len(ends) if edges is None else edges, np.zeros(side.size, dtype=np.int64)
+
+
+for triangles in (0, 8, 70):
+    arguments_of("find_opposite")(partial(paired_sides, triangles=triangles))
+arguments_of("find_opposite")(partial(paired_sides, triangles=8, edges=3))
 
 
 @arguments_of("link_nodes")
@@ -339,6 +351,20 @@ def _(rng):
     """Triangles in column-major order, and vertices without triangles."""
     V, F = disk(5)
     return numbers(rng, len(V)), np.asfortranarray(F[: len(F) // 2]), np.zeros(len(V), dtype=bool)
+
+
+def part_of_disk(rng: np.random.Generator, seeds: int, rings: int) -> Arguments:
+    """Some vertices of a mesh, and room for all triangles."""
+    V, F = disk(9)
+    graph = edge_graph(V, F)
+    order = np.argsort(F.ravel(), kind="stable")
+    start = np.searchsorted(F.ravel()[order], np.arange(len(V) + 1))
+    room = [np.zeros(size, dtype=np.int64) for size in (len(F), len(V), len(graph.ends), F.shape, F.shape, 3)]
+    return start, order // 3, F, graph.side, rng.permutation(len(V))[:seeds], rings, *room
+
+
+for seeds, rings in ((1, 1), (1, 3), (9, 2), (40, 1), (0, 2)):
+    arguments_of("gather_part")(partial(part_of_disk, seeds=seeds, rings=rings))
 
 
 def open_ring(rng: np.random.Generator, costs: str, limit: float, borders: float) -> Arguments:

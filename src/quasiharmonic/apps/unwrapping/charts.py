@@ -14,7 +14,7 @@ from quasiharmonic.apps.unwrapping.chart_search import Workers, search_charts
 from quasiharmonic.apps.unwrapping.coarse_search import CoarseSearch, cut_into_charts
 from quasiharmonic.apps.unwrapping.developed_charts import develop_charts
 from quasiharmonic.apps.unwrapping.draft import Draft
-from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges, find_hinges
 from quasiharmonic.apps.unwrapping.layout import LayoutChoice
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import lay_flat_parts, unfold_small_components
@@ -45,6 +45,7 @@ def find_charts(
     uv: FloatArray | None = None,
     choose: LayoutChoice | None = None,
     mirror: Mirror | None = None,
+    hinges: Hinges | None = None,
     draft: Draft | None = None,
     callback: Callable[[str, int, int], object] | None = None,
     jobs: int | None = None,
@@ -81,6 +82,8 @@ def find_charts(
     mirror : Mirror, optional
         Mirror images, if seams and charts are to be mirrored. Curved parts are mirrored unless a triangle of theirs
         crosses the plane, or the seams there would grow by more than a quarter.
+    hinges : Hinges, optional
+        The hinges of the triangles, if they are known.
     draft : Draft, optional
         Gets the charts so far, in case that a time limit ends the search.
     callback : callable, optional
@@ -100,7 +103,7 @@ def find_charts(
     demanded = cost <= DEMANDED_COST
     given = _ends(F, demanded) if uv_cuts is None else np.asarray(uv_cuts, dtype=np.int64)
     if uv_cuts is None:
-        exact, charts = _develop(V, F, cost, max_stretch, max_charts, choose, workers, mirror)
+        exact, charts = _develop(V, F, cost, max_stretch, max_charts, choose, workers, mirror, hinges)
         working, rest = list[WorkingChart](), np.flatnonzero(~exact)
     else:
         exact, charts = _lay_flat(V, F, given)
@@ -183,10 +186,12 @@ def _develop(
     choose: LayoutChoice | None,
     workers: Workers,
     mirror: Mirror | None,
+    hinges: Hinges | None,
 ) -> tuple[BoolArray, list[Chart]]:
     """Make charts of the developable parts; return a mask (f,) of their triangles, and the charts."""
+    hinges = find_hinges(V, F) if hinges is None else hinges
     undivided = cost >= UNDIVIDED_COST
-    mask, charts = unfold_small_components(V, F, undivided, cost <= DEMANDED_COST)
+    mask, charts = unfold_small_components(V, F, hinges, undivided, cost <= DEMANDED_COST)
     rows = np.flatnonzero(~mask)
     if not rows.size:
         return mask, charts
@@ -195,13 +200,14 @@ def _develop(
         V,
         F[rows],
         cost[rows],
+        hinges if rows.size == len(F) else find_hinges(V, F[rows]),
         None if choose is None else choose.select(rows),
         workers.check_wanted,
         own_mirror,
         max_stretch=max_stretch,
     )
-    left = np.inf if max_charts is None else max_charts - len(charts) - len(more)
-    if int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1 <= left:
+    left = None if max_charts is None else max_charts - len(charts) - len(more)
+    if left is None or int(fans(F[rows[~developed]])[1].max(initial=-1)) + 1 <= left:
         charts += [replace(chart, triangles=rows[chart.triangles]) for chart in more]
         mask[rows[developed]] = True
     return mask, charts

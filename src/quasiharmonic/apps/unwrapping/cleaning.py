@@ -267,8 +267,9 @@ def clean(
     points = np.pad(np.ldexp(V, -exponent), [(0, 0), (0, 3 - V.shape[1])])
     points, moved, thin, degenerate, twice_area = widen(points, joint[F], V.shape[1])
     # Triangles with corners at equal positions are degenerate without welding, too.
-    apart = (V[F] != V[F[:, (1, 2, 0)]]).any(axis=2).all(axis=1)
-    collapsed = np.flatnonzero(are_collapsed(joint[F]) & apart)
+    collapsed = np.flatnonzero(are_collapsed(joint[F]))
+    at = V[F[collapsed]]
+    collapsed = collapsed[(at != at[:, (1, 2, 0)]).any(axis=2).all(axis=1)]
     if degenerate.all():
         merged = f"; welding at distance {weld:g} merges corners of {collapsed.size}, choose a smaller distance"
         every = f"all {len(F)} triangles are degenerate: each" if len(F) > 1 else "the only triangle is degenerate: it"

@@ -15,7 +15,7 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import convex_hull, find_smallest_box
 from quasiharmonic.apps.unwrapping.chart import Chart, cut_out_chart
-from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, ahead, find_hinges
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, ahead
 from quasiharmonic.apps.unwrapping.layout import LayoutChoice
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
@@ -62,6 +62,7 @@ def develop_charts(
     V: FloatArray,
     F: IntArray,
     cost: FloatArray,
+    hinges: Hinges,
     choose: LayoutChoice | None,
     check_wanted: Callable[[], object],
     mirror: Mirror | None = None,
@@ -78,6 +79,7 @@ def develop_charts(
         Factor on the cost of cutting each side of each triangle. Pieces are joined across sides with factors of at
         least `UNDIVIDED_COST` unless they overlap, and never at factors of at most `DEMANDED_COST`. Pieces that cannot
         be joined at a factor of at least `KEPT_COST` count as curved.
+    hinges : Hinges
     choose : LayoutChoice or None
         How to choose from several lists of charts, whose number decreases; None for the last one.
     check_wanted : callable
@@ -94,7 +96,6 @@ def develop_charts(
     charts : list of Chart
         By rows of ``F``.
     """
-    hinges = find_hinges(V, F)
     demanded = hinges.touch(cost <= DEMANDED_COST)
     pieces = find_pieces(V, F, hinges, cost, mirror, max_stretch=max_stretch)
     if not pieces.count:

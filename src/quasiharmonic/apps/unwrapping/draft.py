@@ -20,7 +20,7 @@ from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import covers_once
 from quasiharmonic.geometry.mesh.splitting import fans
-from quasiharmonic.geometry.mesh.topology import edge_keys, find_pairs, label_components, mark_sides
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_pairs, mark_sides, number_components
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_exponent, mark
 
 # Largest and smallest bound in radians on the angle between a triangle and the plane of its chart.
@@ -182,7 +182,7 @@ def _join(
     # Neighbours that face the same cell of directions are joined at once.
     facing = _find_cells(normal, most)
     alike = facing[one // 3] == facing[other // 3]
-    part = _rank(label_components(one[alike] // 3, other[alike] // 3, len(F)))
+    part = number_components(one[alike] // 3, other[alike] // 3, len(F))
     cross = _sum_rows(cross, part)
     middle = _scale_to_one(cross)
     radius = np.zeros(len(middle))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from quasiharmonic.geometry.mesh.reference import cross, dot
 from quasiharmonic.geometry.mesh.topology import find_pairs
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
@@ -93,20 +94,21 @@ def find_hinges(V: FloatArray, F: IntArray) -> Hinges:
     """Return the hinges of a surface with positions (n, 3) and triangles (f, 3) that are not degenerate."""
     one, other = find_pairs(F)
     size = float(np.linalg.norm(np.ptp(V, axis=0)))
-    P = V.take(F, axis=0) / size
-    normal = np.cross(P[:, 1] - P[:, 0], P[:, 2] - P[:, 0])
-    doubled = np.linalg.norm(normal, axis=1)
-    normal /= np.maximum(doubled, np.finfo(float).tiny)[:, None]
+    points = np.ascontiguousarray(V.T) / size
+    at = np.ascontiguousarray(points.take(F.ravel(), axis=1))
+    corners = at.reshape(3, -1, 3)
+    normal = cross(corners[..., 1] - corners[..., 0], corners[..., 2] - corners[..., 0])
+    doubled = np.sqrt(dot(normal, normal))
+    normal /= np.maximum(doubled, np.finfo(float).tiny)
     tiny = doubled <= _LEAST_AREA * doubled.sum()
-    flat_P = P.reshape(-1, 3)
-    start = flat_P.take(one, axis=0)
-    along = flat_P.take(ahead(one), axis=0) - start
-    length = np.linalg.norm(along, axis=1)
-    a, b = normal.take(one // 3, axis=0), normal.take(other // 3, axis=0)
-    sine = np.linalg.norm(np.cross(a, b), axis=1)
-    angle = np.arctan2(sine, (a * b).sum(axis=1))
-    above = ((flat_P.take(previous_sides(other), axis=0) - start) * a).sum(axis=1)
-    height = np.maximum(np.abs(above), np.abs(((flat_P.take(previous_sides(one), axis=0) - start) * b).sum(axis=1)))
+    start = at.take(one, axis=1)
+    along = at.take(ahead(one), axis=1) - start
+    length = np.sqrt(dot(along, along))
+    a, b = normal.take(one // 3, axis=1), normal.take(other // 3, axis=1)
+    sine = cross(a, b)
+    angle = np.arctan2(np.sqrt(dot(sine, sine)), dot(a, b))
+    above = dot(at.take(previous_sides(other), axis=1) - start, a)
+    height = np.maximum(np.abs(above), np.abs(dot(at.take(previous_sides(one), axis=1) - start, b)))
     flat = (height <= FLAT) & (angle <= _FLAT_ANGLE) & ~(tiny[one // 3] | tiny[other // 3])
     fraction, exponent = np.frexp(length * size)
     rounded = np.ldexp(np.rint(np.ldexp(fraction, _BITS)), exponent - _BITS)

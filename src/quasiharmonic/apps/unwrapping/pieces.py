@@ -7,6 +7,7 @@ smaller angles, down to a few degrees; there, only large and compact parts are p
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +18,9 @@ from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, 
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import covers_once, find_forest, lay_along, meet
 from quasiharmonic.energies.measures import distortion
-from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes, surface_area
+from quasiharmonic.geometry.mesh.reference import corner_angles, dot, rest_shapes, surface_area
 from quasiharmonic.geometry.mesh.splitting import fans
-from quasiharmonic.geometry.mesh.topology import boundary_loops, label_components
+from quasiharmonic.geometry.mesh.topology import boundary_loops, label_components, number_components
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at
 from quasiharmonic.util.progress import heartbeat
 
@@ -112,32 +113,44 @@ class _Parts:
     """Parts of a surface (f, 3) whose triangles are connected by joined hinges (e,)."""
 
     def __init__(self, F: IntArray, hinges: Hinges, joined: BoolArray, angles: FloatArray, area: FloatArray) -> None:
-        self.F, self.hinges, self.joined = F, hinges, joined
-        open_sides = ~hinges.mark_sides(joined, len(F))
-        self.split, self.component = fans(F, pairs=(hinges.one[joined], hinges.other[joined]))
+        self.F, self.hinges, self.joined, self.angles = F, hinges, joined, angles
+        self.open_sides = ~hinges.mark_sides(joined, len(F))
+        self.component = number_components(hinges.first[joined], hinges.second[joined], len(F))
         self.count = int(self.component.max(initial=-1)) + 1
-        number = int(self.split.max(initial=-1)) + 1
         self.area = np.bincount(self.component, area, self.count)
-        part = np.zeros(number, dtype=np.int64)
-        part[self.split] = self.component[:, None]
-        rim = mark(number, self.split[open_sides])
-        rim[np.roll(self.split, -1, axis=1)[open_sides]] = True
-        total = np.bincount(self.split.ravel(), angles.ravel(), number)
-        defect = np.where(rim, 0.0, np.abs(2 * np.pi - total))
-        self.apexes = np.flatnonzero(defect > _TUNING.defect)
-        few = np.bincount(part[self.apexes], minlength=self.count) <= _TUNING.apexes
-        curved = np.bincount(part, np.where(defect > _TUNING.defect, 0.0, defect), self.count) > _TUNING.all_defects
-        self.developable = mark(self.count, part[rim]) & few & ~curved
+        total = np.bincount(F.ravel(), angles.ravel())
+        inside, part = mark(total.size, F), np.zeros(total.size, dtype=np.int64)
+        for corner in (0, 1, 2):
+            inside[F[self.open_sides[:, corner - 1] | self.open_sides[:, corner], corner]] = False
+            part[F[:, corner]] = self.component
+        defect = np.where(inside, np.abs(2 * np.pi - total), 0.0)
+        # The vertices of the surface at which a part has an apex.
+        self.tips = defect > _TUNING.defect
+        few = np.bincount(part[self.tips], minlength=self.count) <= _TUNING.apexes
+        curved = np.bincount(part, np.where(self.tips, 0.0, defect), self.count) > _TUNING.all_defects
+        self.developable = mark(self.count, self.component[self.open_sides.any(axis=1)]) & few & ~curved
+
+    @cached_property
+    def split(self) -> IntArray:
+        """The triangles (f, 3) with separate vertices for each part."""
+        return fans(self.F, pairs=(self.hinges.one[self.joined], self.hinges.other[self.joined]))[0]
+
+    @cached_property
+    def rough(self) -> BoolArray:
+        """The parts (c,) at most of whose corners the surface is rounded, or many parts meet."""
+        split, number = self.split, int(self.split.max()) + 1
+        rim = mark(number, split[self.open_sides], np.roll(split, -1, axis=1)[self.open_sides])
+        part, at = np.zeros((2, number), dtype=np.int64)
+        part[split], at[split] = self.component[:, None], self.F
         # The number of parts around a vertex, at each vertex of a part's rim.
-        at = np.zeros(number, dtype=np.int64)
-        at[self.split] = F
         around = np.bincount(at)[at]
+        total = np.bincount(split.ravel(), self.angles.ravel(), number)
         curvature = np.abs(2 * np.pi - np.bincount(at, total))[at]
         little = np.where(around == 3, _TUNING.little_at_three, _TUNING.little_at_four)
         rounded = (curvature > _TUNING.defect) & (curvature < little)
         corner = rim & (around >= 3)
         rough = np.bincount(part[corner], (rounded | (around >= _TUNING.many_pieces))[corner], self.count)
-        self.rough = rough > _TUNING.rough * np.bincount(part[corner], minlength=self.count)
+        return np.asarray(rough > _TUNING.rough * np.bincount(part[corner], minlength=self.count))
 
     def find_cut(self, k: int, here: IntArray, cost: FloatArray) -> IntArray:
         """Return the cheapest cut among hinges ``here`` of part ``k`` that gives a disk, its apexes on the boundary."""
@@ -149,7 +162,7 @@ class _Parts:
             terminal[loop] = number
         side = self.hinges.one[here]
         ends = np.stack([self.split.ravel()[side], np.roll(self.split, -1, axis=1).ravel()[side]], axis=1)
-        apexes = np.searchsorted(names, np.intersect1d(self.apexes, names))
+        apexes = np.unique(own.reshape(-1, 3)[self.tips[self.F[rows]]])
         return _find_cut(np.searchsorted(names, ends), cost, terminal, apexes)
 
 
@@ -244,22 +257,31 @@ def find_pieces(
     shapes = rest_shapes(V, F)
     area = shapes.m / shapes.m.sum()
     angles, whole = corner_angles(shapes.sides), surface_area(V, F)
-    length = np.linalg.norm(V[F] - V[np.roll(F, -1, axis=1)], axis=2)
+    corners = np.ascontiguousarray(V.T).take(F, axis=1)
+    along = corners - np.roll(corners, -1, axis=2)
+    length = np.sqrt(dot(along, along))
     found = Pieces(np.full(len(F), -1), np.zeros(F.shape, dtype=np.complex128), np.zeros(hinges.one.size, dtype=bool))
     torus = find_coarse_tori(V, F, hinges, max_stretch, apart)
     flat = _mark_flat(F, hinges, angles, len(V))
     for angle in (CREASE, *np.deg2rad(_TUNING.angles), 0.0):
         heartbeat()
         rest = (found.label < 0) & ~torus
+        if not rest.any():
+            break
         many = np.count_nonzero(rest) > _TUNING.many_triangles
         if 0 < angle < CREASE and many and area[rest & flat].sum() < _TUNING.min_share:
             continue
         within = ~apart & rest[hinges.first] & rest[hinges.second]
         # What is left between pieces can be developable as a whole, with its creases.
         joined = within & ((np.abs(hinges.angle) <= angle) | hinges.flat | together) if angle else within
+        if 2 * np.count_nonzero(joined) == F.size:
+            # Closed surfaces are not developable.
+            continue
         parts = _Parts(F, hinges, joined, angles, area)
         chosen = parts.developable & mark(parts.count, parts.component[rest])
-        outline = np.where(hinges.mark_sides(joined, len(F)), 0.0, length)
+        if not chosen.any():
+            continue
+        outline = np.where(parts.open_sides, length, 0.0)
         rim: FloatArray = np.bincount(parts.component, outline.sum(axis=1), parts.count).astype(np.float64)
         if angle == CREASE:
             chosen &= ~parts.rough | (parts.area >= _TUNING.large_share)
@@ -268,8 +290,6 @@ def find_pieces(
             chosen &= (parts.area >= _TUNING.min_share) & (rim**2 <= _TUNING.max_perimeter * parts.area * whole)
         if chosen.any():
             _unroll(V, parts, chosen, cost, found, mirror)
-        if (torus | (found.label >= 0)).all():
-            break
     return found
 
 

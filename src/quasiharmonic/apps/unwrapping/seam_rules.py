@@ -64,6 +64,7 @@ class Rules(NamedTuple):
         Mirror images, if the model is symmetric.
     symmetry : Symmetry
     wanted : WantedSeams
+    hinges : Hinges
     """
 
     cost: FloatArray
@@ -72,6 +73,7 @@ class Rules(NamedTuple):
     mirror: Mirror | None
     symmetry: Symmetry
     wanted: WantedSeams
+    hinges: Hinges
 
 
 def find_rules(
@@ -140,7 +142,7 @@ def find_rules(
     if uv_cuts is not None:
         sides = np.stack([cleaned.F[demanded], cleaned.F[:, (1, 2, 0)][demanded]], axis=1)
         uv_cuts = np.concatenate([uv_cuts, sides])
-    return Rules(cost, uv, uv_cuts, mirror, symmetry, wanted)
+    return Rules(cost, uv, uv_cuts, mirror, symmetry, wanted, hinges)
 
 
 def _find_smooth_rings(F: IntArray, hinges: Hinges) -> BoolArray:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.unwrapping.hinges import ahead, previous_sides
-from quasiharmonic.geometry.mesh.topology import edge_keys, label_components
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, label_components, opposite_sides
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, repeat_each
 
 
@@ -100,21 +100,22 @@ def join_sheets(points: FloatArray, F: IntArray, corners: IntArray, area: FloatA
     thin : (f,) bool
         Triangles whose angles at edges are arbitrary. At edges of several triangles, they are joined last.
     """
-    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
-    key = edge_keys(tail, head, len(points))
-    order = np.argsort(key)
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-    count = np.diff(first, append=key.size)
-    two = first[count == 2]
-    one, other = np.minimum(order[two], order[two + 1]), np.maximum(order[two], order[two + 1])
-    links = Links(one, other, tail[one] == tail[other])
+    side = find_sides(F, len(points))[1]
+    opposite, side = opposite_sides(side), side.ravel()
+    count = np.bincount(side)
+    first = np.flatnonzero(opposite > np.arange(side.size))
+    by_edge = np.empty(count.size, dtype=np.int64)
+    by_edge[side[first]] = first
+    one = by_edge[count == 2]
+    other = opposite[one]
+    # Sides of one edge run in the same direction if they start at the same end.
+    links = Links(one, other, F.ravel()[one] == F.ravel()[other])
     turned, fits = _orient(links, np.zeros(len(F), dtype=bool), area)
     contested = [one[~fits], other[~fits]]
     links = links.select(fits)
     if (count > 2).any():
-        crowd = repeat_each(count > 2, count)
-        # The order of equal keys is arbitrary.
-        crowded = order[crowd][np.lexsort((order[crowd], key[order[crowd]]))]
+        crowded = np.flatnonzero((count > 2)[side])
+        crowded = crowded[np.argsort(side[crowded], kind="stable")]
         contested.append(crowded)
         links = links.join(_pair(points, F, corners, turned, thin, crowded, count[count > 2]))
         turned, fits = _orient(links, turned, area)

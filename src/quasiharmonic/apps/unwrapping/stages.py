@@ -254,6 +254,7 @@ def _search(task: Task, draft: Draft, density: float | None) -> list[Chart]:
         uv_cuts=rules.uv_cuts,
         uv=None if rules.uv is None else rules.uv[rest],
         mirror=None if rules.mirror is None else rules.mirror.select(np.flatnonzero(rest)),
+        hinges=None if straight else rules.hinges,
         draft=draft,
         choose=LayoutChoice(divide, task.into, float(wanted.packing_loss), task.texture[rest]),
         callback=task.report,

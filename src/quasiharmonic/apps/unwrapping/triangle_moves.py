@@ -16,9 +16,8 @@ from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.reference import rest_shapes
-from quasiharmonic.geometry.mesh.topology import find_pairs
-from quasiharmonic.targets.cuts.graph import edge_graph
-from quasiharmonic.util.arrays import ComplexArray, IntArray, to_complex, to_points
+from quasiharmonic.targets.cuts.graph import edge_graph, triangles_near
+from quasiharmonic.util.arrays import ComplexArray, IntArray, invert_indices, mark, to_complex, to_points
 
 # Charts of at most this number of triangles, with at most this share of the area, are joined to others.
 _SMALL, _SHARE = 32, 0.003
@@ -26,6 +25,8 @@ _SMALL, _SHARE = 32, 0.003
 _TRIES = 12
 # The seam must become shorter by this share of the two sides.
 _SAVES = 0.02
+# Only triangles within this many rings around the seams move.
+_RINGS = 3
 # No vertex of an outline may lie in a notch, or this close to it, relative to its height.
 _CLOSE = 0.05
 
@@ -186,18 +187,28 @@ class _SeamedCharts:
         self.changed = np.zeros(len(charts), dtype=bool)
         self.z = np.concatenate([_positions(chart) for chart in charts])
         self.rims = [np.concatenate(chart.piece.loops) + first for chart, first in zip(charts, start, strict=False)]
-        # The mesh of all charts without seams.
-        _, first, own = np.unique(self.vertices, return_index=True, return_inverse=True)
-        T = own[self.F]
-        graph = edge_graph(self.V[first], T, self.cost)
-        self.price = graph.cost[graph.side.T]
+        self.ahead = np.arange(self.F.size).reshape(-1, 3).take((1, 2, 0), axis=1).ravel()
         shapes = rest_shapes(self.V, self.F)
         self.sides = shapes.unit * shapes.sides
-        self.ahead = np.roll(np.arange(T.size).reshape(-1, 3), -1, axis=1).ravel()
-        self.partner = np.full(T.size, -1)
-        one, other = find_pairs(T)
-        self.partner[one], self.partner[other] = other, one
+        self._pair_sides()
         self.fixed = (self.cost <= DEMANDED_COST) | (self.cost >= UNDIVIDED_COST)
+
+    def _pair_sides(self) -> None:
+        """Find the price (f, 3) of each side and the other side (3 f,) of its edge, -1 far from all seams."""
+        n = int(self.vertices.max()) + 1
+        present = np.flatnonzero(mark(n, self.vertices))
+        own = invert_indices(n, present)[self.vertices]
+        points = np.empty((present.size, 3))
+        points[own] = self.V
+        # The mesh of all charts without seams.
+        T = own[self.F]
+        near = np.flatnonzero(triangles_near(T, mark(present.size, *(own[rim] for rim in self.rims)), _RINGS))
+        graph = edge_graph(points, T[near], self.cost[near])
+        self.price = np.zeros(T.shape)
+        self.price[near] = graph.cost[graph.side.T]
+        side, opposite = (3 * near[:, None] + np.arange(3)).ravel(), graph.half_edges[0]
+        self.partner = np.full(T.size, -1)
+        self.partner[side] = np.where(opposite < 0, -1, side[opposite])
 
     def _is_seam(self, side: int) -> bool:
         """Whether a side is on a seam between two triangles."""

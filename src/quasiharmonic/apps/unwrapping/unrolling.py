@@ -155,7 +155,7 @@ def covers_once(F: IntArray, uv: FloatArray, component: IntArray, candidates: Bo
 
 
 def unfold_small_components(
-    V: FloatArray, F: IntArray, undivided: BoolArray, demanded: BoolArray
+    V: FloatArray, F: IntArray, hinges: Hinges, undivided: BoolArray, demanded: BoolArray
 ) -> tuple[BoolArray, list[Chart]]:
     """Unfold the small closed components of a surface that have no demanded cuts.
 
@@ -163,6 +163,7 @@ def unfold_small_components(
     ----------
     V : (n, 3) float64
     F : (f, 3) int64
+    hinges : Hinges
     undivided, demanded : (f, 3) bool
         Sides across which triangles are joined first, such as those inside polygons, and sides that must be seams.
 
@@ -174,7 +175,7 @@ def unfold_small_components(
         One for each of these components.
     """
     mask, charts = np.zeros(len(F), dtype=bool), list[Chart]()
-    component = fans(F)[1]
+    component = fans(F, pairs=(hinges.one, hinges.other))[1]
     chosen = np.bincount(component) <= _SMALL
     if not chosen.any():
         return mask, charts

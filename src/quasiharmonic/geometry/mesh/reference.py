@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 Reference = Literal["equilateral", "rest", "corrected"]
+# Coordinates of vectors: (d, k), or d arrays (k,).
+Coordinates = FloatArray | list[FloatArray]
 
 
 def rest_frames(V: FloatArray, F: NDArray[np.integer]) -> tuple[FloatArray, ComplexArray]:
@@ -91,21 +93,29 @@ def _lay_each_flat(coordinates: FloatArray, F: NDArray[np.integer]) -> tuple[Flo
     corners = [along.take(F) for along in coordinates]
     e1 = [corner[:, 1] - corner[:, 0] for corner in corners]
     e2 = [corner[:, 2] - corner[:, 0] for corner in corners]
-    length = np.sqrt(_dot(e1, e1))
+    length = np.sqrt(dot(e1, e1))
     divisor = np.where(length > 0, length, 1.0)
     normal = [e1[i] * e2[j] - e1[j] * e2[i] for i, j in ((0, 1), (1, 2), (2, 0))[: 1 if len(e1) == 2 else 3]]
-    across = normal[0] if len(normal) == 1 else np.sqrt(_dot(normal, normal))
+    across = normal[0] if len(normal) == 1 else np.sqrt(dot(normal, normal))
     # If vertices 0 and 1 coincide, the direction is arbitrary.
-    along = np.where(length > 0, _dot(e1, e2), np.sqrt(_dot(e2, e2)))
+    along = np.where(length > 0, dot(e1, e2), np.sqrt(dot(e2, e2)))
     return length, along / divisor, across / divisor
 
 
-def _dot(a: list[FloatArray], b: list[FloatArray]) -> FloatArray:
-    """Scalar products of vectors given by their coordinates."""
+def dot(a: Coordinates, b: Coordinates) -> FloatArray:
+    """Scalar products (k,) of vectors given by their coordinates, (d, k) or a list of d arrays."""
     total = a[0] * b[0]
     for x, y in zip(a[1:], b[1:], strict=True):
         total += x * y
     return total
+
+
+def cross(a: Coordinates, b: Coordinates) -> FloatArray:
+    """Cross products (3, k) of vectors given by their coordinates, (3, k) or lists of 3 arrays.
+
+    For many vectors, this is several times as fast as `numpy.cross` by rows, and has the same rounding.
+    """
+    return np.stack([a[k - 2] * b[k - 1] - a[k - 1] * b[k - 2] for k in range(3)])
 
 
 def blocks(count: int) -> Iterator[slice]:
@@ -288,7 +298,7 @@ def area_vectors(V: FloatArray, F: NDArray[np.integer]) -> FloatArray:
     """Return a normal (f, 3) of each triangle F (f, 3) between points V (n, 3); its length is twice the area."""
     # For rows, this is several times as fast as indexing.
     a, b, c = (V.take(corner, axis=0) for corner in F.T)
-    return np.cross(b - a, c - a)
+    return cross((b - a).T, (c - a).T).T
 
 
 def surface_area(V: FloatArray, F: NDArray[np.integer]) -> float:

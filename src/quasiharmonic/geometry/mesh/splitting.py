@@ -22,8 +22,8 @@ from quasiharmonic.geometry.mesh.topology import (
     edge_keys,
     find_pairs,
     group_by_label,
-    label_components,
     mark_sides,
+    number_components,
     pair_keys,
 )
 from quasiharmonic.geometry.mesh.topology import edges as sort_edges
@@ -35,6 +35,7 @@ from quasiharmonic.util.arrays import (
     check_range,
     edge_array,
     first_equal,
+    invert_indices,
     mark,
     reject,
     scale_to_unit,
@@ -68,20 +69,20 @@ def fans(
     component : (f,) int64
         Component of each triangle. Vertices and components are numbered by first appearance.
     """
-    corner = np.arange(F.size).reshape(-1, 3)
-    tail, head = F.ravel(), F[:, (1, 2, 0)].ravel()
-    ahead = corner[:, (1, 2, 0)].ravel()
     one, other = find_pairs(F) if pairs is None else pairs
-    opposed = (tail[one] == head[other]) & (tail[one] != tail[other])
+    # The sides of a pair have the same ends. They have opposite directions if they start at different ends.
+    joined = F.ravel().take(one) != F.ravel().take(other)
     if cut is not None:
-        opposed &= ~(cut.ravel()[one] | cut.ravel()[other])
-    one, other = one[opposed], other[opposed]
+        joined &= ~(cut.ravel()[one] | cut.ravel()[other])
+    if not joined.all():
+        one, other = one[joined], other[joined]
+    ahead = np.arange(F.size).reshape(-1, 3).take((1, 2, 0), axis=1).ravel()
     # The half-edge of a corner begins there. Joining two half-edges identifies the start of each with the end of the
     # other.
-    split = label_components(np.concatenate([one, ahead[one]]), np.concatenate([ahead[other], other]), F.size)
-    component = label_components(one // 3, other // 3, len(F))
-    # Labels are smallest elements, so their rank is the order of appearance.
-    split, component = ((np.cumsum(label == np.arange(label.size)) - 1)[label] for label in (split, component))
+    split = number_components(
+        np.concatenate([one, ahead.take(one)]), np.concatenate([ahead.take(other), other]), F.size
+    )
+    component = number_components(one // 3, other // 3, len(F))
     return split.reshape(-1, 3), component
 
 
@@ -92,9 +93,12 @@ def renumber(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:
     vertices and without gaps keeps its numbers. Also returns one corner of every vertex, as an index into the flattened
     triangles.
     """
-    _, first, own = np.unique(split.ravel(), return_index=True, return_inverse=True)
-    order = np.argsort(F.ravel()[first], kind="stable")
-    return np.argsort(order)[own.reshape(-1, 3)], first[order]
+    corner = np.full(int(split.max(initial=-1)) + 1, -1)
+    # The first corner of each vertex is written last.
+    corner[split.ravel()[::-1]] = np.arange(split.size)[::-1]
+    first = corner[corner >= 0]
+    first = first[np.argsort(F.ravel()[first], kind="stable")]
+    return invert_indices(corner.size, split.ravel()[first])[split], first
 
 
 def number_fans(F: IntArray, split: IntArray, n: int) -> tuple[IntArray, IntArray]:

@@ -124,21 +124,37 @@ def find_pairs(F: IntArray) -> tuple[IntArray, IntArray]:
 
     Side 3 t + k runs from corner k of triangle t to the next.
     """
-    return pair_sides(find_sides(F, int(F.max(initial=-1)) + 1)[1])
+    opposite = opposite_sides(find_sides(F, int(F.max(initial=-1)) + 1)[1])
+    one = np.flatnonzero(opposite > np.arange(opposite.size))
+    return one, opposite[one]
 
 
-def pair_sides(side: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the result of `find_pairs`, given the edge (f, 3) of each side."""
+def opposite_sides(side: IntArray) -> IntArray:
+    """Return the other side (3 f,) of each side's edge, given the edge (f, 3) of each; -1 if there is not exactly one.
+
+    Side 3 t + k is that of triangle t from corner k to the next.
+    """
+    opposite = np.empty(side.size, dtype=np.int64)
+    edges = int(side.max(initial=-1)) + 1
+    if not find_opposite(side, edges, opposite):
+        check_range("side", side, edges)
+    return opposite
+
+
+@compiled
+def find_opposite(side: IntArray, edges: int, opposite: IntArray) -> int:
+    """Fill in the result (3 f,) of `opposite_sides`; return 0 if an edge is out of range, else 1."""
     side = side.ravel()
-    first, last = np.empty((2, int(side.max(initial=-1)) + 1), dtype=np.int64)
+    if side.min(initial=0) < 0 or side.max(initial=-1) >= edges:
+        return 0
+    first, last = np.empty((2, edges), dtype=np.int64)
     here = np.arange(side.size)
     last[side] = here
     first[side[::-1]] = here[::-1]
-    two = np.bincount(side, minlength=first.size) == 2
-    other = np.full(side.size, -1)
-    other[first[two]] = last[two]
-    one = np.flatnonzero(other >= 0)
-    return one, other[one]
+    two = np.bincount(side, minlength=edges) == 2
+    opposite[:] = -1
+    opposite[first[two]], opposite[last[two]] = last[two], first[two]
+    return 1
 
 
 def edge_keys(tail: NDArray[np.integer], head: NDArray[np.integer], n: int) -> IntArray:
@@ -286,6 +302,16 @@ def label_components(tail: IntArray, head: IntArray, n: int) -> IntArray:
         for nodes in (tail, head):
             check_range("a link", nodes, n, "node", "nodes")
     return label
+
+
+def number_components(tail: IntArray, head: IntArray, n: int) -> IntArray:
+    """Number of the connected component of every node of a graph, (n,) int64, by first appearance.
+
+    The arguments are those of `label_components`.
+    """
+    label = label_components(tail, head, n)
+    # Labels are smallest nodes, so their rank is the order of appearance.
+    return (np.cumsum(label == np.arange(n)) - 1).take(label)
 
 
 def group_by_label(label: IntArray) -> list[IntArray]:

@@ -14,8 +14,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.geometry.coarsening import has_marked_corner, mark_rings
-from quasiharmonic.geometry.mesh.reference import area_vectors, surface_area
-from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, pair_keys, pair_sides
+from quasiharmonic.geometry.mesh.reference import area_vectors, cross, dot, surface_area
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, opposite_sides, pair_keys
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -25,6 +25,7 @@ from quasiharmonic.util.arrays import (
     pad_to_space,
     scale_to_unit,
 )
+from quasiharmonic.util.kernels import compiled
 
 # A concave edge with this dihedral bend, or a convex edge with twice as much, has half its cost.
 _SHARP = 0.5 * np.pi
@@ -71,16 +72,16 @@ class EdgeGraph:
     @property
     def bends(self) -> FloatArray:
         """Angles (e,) in radians by which the surface bends at edges: positive if convex, negative if concave."""
-        normal = area_vectors(self.V, self.F)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(np.float64).tiny)[:, None]
+        normal = area_vectors(self.V, self.F).T
+        normal /= np.maximum(np.sqrt(dot(normal, normal)), np.finfo(np.float64).tiny)
         # ``left`` is the triangle in which the edge runs from the smaller vertex to the larger, ``right`` the other.
         falls = self.F.T[(1, 2, 0), :] < self.F.T
         around = np.zeros((2, len(self.ends)), dtype=np.int64)
         around.ravel()[self.side + len(self.ends) * falls] = np.arange(len(self.F))
-        left, right = (normal.take(triangle, axis=0) for triangle in around)
+        left, right = (normal.take(triangle, axis=1) for triangle in around)
         along = self.V.take(self.ends[:, 1], axis=0) - self.V.take(self.ends[:, 0], axis=0)
-        sine = (np.cross(left, right) * along).sum(axis=1) / self.length
-        cosine = (left * right).sum(axis=1)
+        sine = dot(cross(left, right), along.T) / self.length
+        cosine = dot(left, right)
         return np.where(self.rim, 0, np.arctan2(sine, cosine))
 
     def mark_vertices(self, chosen: BoolArray) -> BoolArray:
@@ -94,15 +95,13 @@ class EdgeGraph:
         Half-edges on the outside have -1 for their opposite.
         """
         side = np.ascontiguousarray(self.side.T).ravel()
-        one, other = pair_sides(side)
-        opposite = np.full(side.size, -1)
-        opposite[one], opposite[other] = other, one
-        return opposite, side
+        return opposite_sides(side), side
 
     def list_pairs(self) -> tuple[IntArray, IntArray, IntArray]:
         """Return the two triangles at each interior edge, and the edge; (i,) int64 each, by the first triangle."""
-        one, other = pair_sides(self.side.T)
-        return one // 3, other // 3, self.side.T.ravel()[one]
+        opposite, side = self.half_edges
+        one = np.flatnonzero(opposite > np.arange(opposite.size))
+        return one // 3, opposite[one] // 3, side[one]
 
     @cached_property
     def _stars(self) -> tuple[IntArray, IntArray]:
@@ -117,17 +116,16 @@ class EdgeGraph:
         surface are missing: edges there cost infinitely.
         """
         start, star = self._stars
-        triangles = np.empty(0, dtype=np.int64)
-        for _ in range(rings):
-            which, nth = enumerate_each(start[vertices + 1] - start[vertices])
-            triangles = find_distinct(star[start[vertices][which] + nth])
-            vertices = find_distinct(self.F[triangles])
-        side = self.side[:, triangles]
-        own = find_distinct(side)
-        number = np.searchsorted(own, side)
-        ends = np.searchsorted(vertices, self.ends[own])
-        F = np.searchsorted(vertices, self.F[triangles])
-        graph = EdgeGraph(self.V[vertices], F, ends, number, self.rim[own], self.length[own], self.cost[own])
+        triangles, chosen, own = (np.empty(size, dtype=np.int64) for size in (len(self.F), self.n, len(self.ends)))
+        (corners, sides), sizes = np.empty((2, *self.F.shape), dtype=np.int64), np.empty(3, dtype=np.int64)
+        gather_part(start, star, self.F, self.side, vertices, rings, triangles, chosen, own, corners, sides, sizes)
+        many, chosen, own = sizes[0], chosen[: sizes[1]], own[: sizes[2]].copy()
+        F, number = corners[:many].copy(), np.ascontiguousarray(sides[:many].T)
+        place = np.empty(self.n, dtype=np.int64)
+        place[chosen] = np.arange(chosen.size)
+        graph = EdgeGraph(
+            self.V[chosen], F, place[self.ends[own]], number, self.rim[own], self.length[own], self.cost[own]
+        )
         return graph.without_paths_at(np.bincount(number.ravel()) == 1), own
 
     def without_paths_at(self, outer: BoolArray) -> EdgeGraph:
@@ -190,6 +188,38 @@ def find_distinct(values: IntArray) -> IntArray:
     return values[np.flatnonzero(np.diff(values, prepend=-1))]
 
 
+@compiled
+def gather_part(
+    start: IntArray,
+    star: IntArray,
+    F: IntArray,
+    side: IntArray,
+    seeds: IntArray,
+    rings: int,
+    triangles: IntArray,
+    vertices: IntArray,
+    edges: IntArray,
+    corners: IntArray,
+    sides: IntArray,
+    sizes: IntArray,
+) -> None:
+    """Fill in the triangles in some rings around vertices, their vertices and edges, ascending, and their numbers (3,).
+
+    ``corners`` and ``sides`` (f, 3) get the places of their corners and sides among these. The triangles around each
+    vertex are in ``star``, from where ``start`` says; the edges of the sides are ``side`` (3, f).
+    """
+    near, some = seeds, np.empty(0, dtype=np.int64)
+    for _ in range(rings):
+        which, nth = enumerate_each(start[near + 1] - start[near])
+        some = find_distinct(star[start[near][which] + nth])
+        near = find_distinct(F[some])
+    own = find_distinct(side[:, some])
+    sizes[:] = some.size, near.size, own.size
+    triangles[: some.size], vertices[: near.size], edges[: own.size] = some, near, own
+    corners[: some.size] = np.searchsorted(near, F[some])
+    sides[: some.size] = np.searchsorted(own, side[:, some].T)
+
+
 def edge_graph(V: FloatArray, F: IntArray, costs: FloatArray | None = None) -> EdgeGraph:
     """Build the `EdgeGraph` of a surface, with lengths and costs.
 
@@ -221,7 +251,7 @@ def edge_graph(V: FloatArray, F: IntArray, costs: FloatArray | None = None) -> E
     length = np.linalg.norm(along, axis=1)
     # Lengths must be positive, because zeros are not edges in a sparse graph.
     length = np.maximum(length, max(1e-12 * float(length.mean()), np.finfo(np.float64).tiny))
-    graph = EdgeGraph(space, F, ends, side, rim, length, length)
+    graph = EdgeGraph(space, np.ascontiguousarray(F), ends, side, rim, length, length)
     bend = graph.bends
     sharpness = np.minimum(np.maximum(-bend, 0.5 * bend) / _SHARP, 1)
     cost = length * (1 - _SAVED * sharpness)

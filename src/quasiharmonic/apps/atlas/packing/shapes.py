@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from quasiharmonic.geometry.exact.triangles import triangle_signs
+from quasiharmonic.geometry.mesh.topology import find_sides
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, IntArray, repeat_each, to_complex
 from quasiharmonic.util.kernels import compiled
 
@@ -90,10 +91,9 @@ def make_shape(uv: FloatArray, F: IntArray) -> Shape:
     rows = np.where((sign < 0)[:, None], F[:, ::-1], F)
     tail, head = rows.ravel(), np.roll(rows, -1, axis=1).ravel()
     # Opposite directed edges cancel.
-    lower, upper = np.minimum(tail, head), np.maximum(tail, head)
-    key, place = np.unique(lower * len(z) + upper, return_inverse=True)
-    count = np.bincount(place, np.where(tail < head, 1, -1), len(key)).astype(np.int64)
-    lower, upper = np.divmod(key, len(z))
+    ends, side = find_sides(rows, len(z))
+    count = np.bincount(side.ravel(), np.where(tail < head, 1, -1), len(ends)).astype(np.int64)
+    lower, upper = ends.T
     first, second = np.where(count > 0, lower, upper), np.where(count > 0, upper, lower)
     first, second = repeat_each(first, np.abs(count)), repeat_each(second, np.abs(count))
     thin = F[sign == 0]

@@ -12,6 +12,7 @@
     with(nearest_point) \
     with(nested_grid) \
     with(newton_system) \
+    with(part) \
     with(pattern) \
     with(placing) \
     with(point_location) \

@@ -167,6 +167,56 @@ static PyObject *number_sides(PyObject *module, PyObject *const *given, Py_ssize
     return done_with_integer(a, LENGTH(a), (Py_ssize_t)edges);
 }
 
+/* Marks in `first`: no side of the edge so far; two or more sides, from which on the mark tells the first of two. */
+enum { NO_SIDE = -1, TWO_SIDES = -2 };
+
+/* The other side of the same edge for each side, -1 where an edge has not exactly two. `first` gets the first side of each
+ * edge, or a mark. */
+static void pair(const int64_t *side, Py_ssize_t sides, int64_t *first, int64_t *opposite)
+{
+    for (int64_t j = 0; j < sides; j++) {
+        int64_t *here = first + side[j];
+        opposite[j] = -1;
+        if (*here == NO_SIDE)
+            *here = j;
+        else if (*here >= 0) {
+            opposite[j] = *here;
+            opposite[*here] = j;
+            *here = TWO_SIDES - *here;
+        } else {
+            const int64_t one = TWO_SIDES - *here, other = opposite[one];
+            opposite[one] = -1;
+            if (other >= 0)
+                opposite[other] = -1;
+        }
+    }
+}
+
+/* (side, edges, opposite): the other side of the same edge for each side of triangles; 0 where `side` names an edge that
+ * there is not. */
+static PyObject *find_opposite(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[3];
+    if (!take("find_opposite", given, count, "qnQ", a))
+        return NULL;
+    const Py_ssize_t edges = a[1].integer;
+    if (!fit("find_opposite", a, LENGTH(a), edges >= 0 && a[2].size == a[0].size))
+        return NULL;
+    if (!are_indices(a, edges))
+        return done_with_integer(a, LENGTH(a), 0);
+    int64_t *first = malloc((size_t)(edges + 1) * sizeof(*first));
+    if (!first)
+        return out_of_memory(a, LENGTH(a));
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t i = 0; i < edges; i++)
+        first[i] = NO_SIDE;
+    pair(a[0].data, a[0].size, first, a[2].data);
+    Py_END_ALLOW_THREADS
+    free(first);
+    return done_with_integer(a, LENGTH(a), 1);
+}
+
 /* The root of a node, and the way there halved. */
 static int64_t root(int64_t *label, int64_t node)
 {
@@ -289,5 +339,5 @@ static PyObject *follow_loops(PyObject *module, PyObject *const *given, Py_ssize
 }
 
 PyMethodDef topology_kernels[] = {
-    KERNEL(sort_edges), KERNEL(number_sides), KERNEL(link_nodes), KERNEL(follow_loops), END_OF_KERNELS,
+    KERNEL(sort_edges), KERNEL(number_sides), KERNEL(find_opposite), KERNEL(link_nodes), KERNEL(follow_loops), END_OF_KERNELS,
 };
