@@ -49,6 +49,8 @@ Callback = Callable[[str, int, int], object]
 
 #: The aim for charts of a coarse mesh, whose seams are carried to the surface: this fraction of the permitted stretch.
 AIM_OF_CARRIED = 0.75
+#: On smaller surfaces, threads mostly wait for the interpreter: with two, a search takes a quarter longer than with one.
+MANY_TRIANGLES = 200_000
 # Seconds between two calls of the callback while nothing is finished.
 _TICK = 0.25
 # Two sides of a cut lie at the same place if their ends are at most this fraction of their length apart.
@@ -98,10 +100,13 @@ class Workers:
         if self._stop.is_set():
             raise KeyboardInterrupt
 
-    def map(self, phase: str, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
-        """Apply a function to every item, largest items first if they are so ordered; results in order of the items."""
+    def map(self, phase: str, function: Callable[[T], R], items: Sequence[T], triangles: int) -> list[R]:
+        """Apply a function to every item, largest items first if they are so ordered; results in order of the items.
+
+        ``triangles`` is their number on the searched surface. Few triangles are searched in the caller's thread.
+        """
         self._report(phase, 0, len(items))
-        if self._jobs == 1 or len(items) < 2:
+        if self._jobs == 1 or len(items) < 2 or triangles < MANY_TRIANGLES:
             return self._map_here(phase, function, items)
         pool = make_executor(self._jobs, "find_charts")
         try:
@@ -168,10 +173,11 @@ def search_charts(
     """
     carried = any(chart.start is not None for chart in charts)
     aim = 1 + (1.0 if not joinable else AIM_OF_CARRIED if carried else _TUNING.aim) * (bound - 1)
-    root = sum(len(chart.F) for chart in charts) ** 0.5
-    few, many = (len(charts) + round(base + share * root) for base, share in (_TUNING.aim_charts, _TUNING.bound_charts))
+    triangles = sum(len(chart.F) for chart in charts)
+    few, many = (len(charts) + round(base + share * triangles**0.5) for base, share in (_TUNING.aim_charts, _TUNING.bound_charts))
     keep([*charts])
-    here = [part for parts in workers.map("flatten", partial(_flatten_first, aim, workers), charts) for part in parts]
+    flattened = workers.map("flatten", partial(_flatten_first, aim, workers), charts, triangles)
+    here = [part for parts in flattened for part in parts]
     keep(here)
     for goal, rounds, most in ((aim, _TUNING.aim_rounds, few), (bound, _TUNING.bound_rounds, many)):
         for _ in range(rounds):
@@ -188,7 +194,7 @@ def search_charts(
                 )
                 for rank, (k, stretched) in enumerate(chosen)
             ]
-            found = workers.map("improve", partial(_improve, goal, workers, joinable), jobs)
+            found = workers.map("improve", partial(_improve, goal, workers, joinable), jobs, triangles)
             changed = {k: parts for (k, _), (parts, same) in zip(chosen, found, strict=True) if not same}
             here = [part for k, chart in enumerate(here) for part in changed.get(k, [chart])]
             keep(here)
@@ -197,8 +203,8 @@ def search_charts(
     here = [_close(chart, joinable) for chart in here]
     keep(here)
     overlapping = [chart for chart in here if not chart.bijective]
-    workers.map("separate", partial(guard_chart, check_wanted=workers.check_wanted), overlapping)
-    workers.map("improve", partial(relax_thin, bound=bound), here)
+    workers.map("separate", partial(guard_chart, check_wanted=workers.check_wanted), overlapping, triangles)
+    workers.map("improve", partial(relax_thin, bound=bound), here, triangles)
     if not joinable:
         return here
     return move_teeth(join_small_charts(here, aim, total_area, workers.check_wanted), aim)

@@ -145,7 +145,7 @@ def find_charts(
         )
         return _finish(found, max_stretch, share * total)
 
-    working += [chart for some in workers.map("cut", cut, [rest] if rest.size else []) for chart in some]
+    working += [chart for some in workers.map("cut", cut, [rest] if rest.size else [], rest.size) for chart in some]
     half = rest[mirror.positive[rest]] if mirror is not None else rest[:0]
     one_side = cut(half) if half.size and 2 * half.size == rest.size else []
     if mirror is not None and one_side and _are_short(one_side, working, F[rest], V):

@@ -169,7 +169,7 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     callback : callable, optional
         Called with an `UnwrapStep`, at least every half second. Exceptions propagate.
     jobs : int, optional
-        Number of threads. Default: all cores. The result does not depend on it.
+        Number of threads for models of many triangles. Default: all cores. The result does not depend on it.
 
     Returns
     -------
