@@ -138,11 +138,19 @@ class EdgeGraph:
         return np.searchsorted(pair_keys(self.ends, self.n), edge_keys(tail, head, self.n))
 
     @cached_property
-    def _rows(self) -> tuple[IntArray, IntArray]:
-        """Larger vertices of the edges (e,), and where the edges of each smaller vertex start (n + 1,)."""
+    def _rows(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Neighbours (2 e,) of each vertex, the edges to them (2 e,), and where those of each vertex start (n + 1,)."""
+        count, (smaller, larger) = len(self.ends), self.ends.T
+        above = np.searchsorted(smaller, np.arange(self.n + 1))
+        columns = csr_array((np.arange(count), larger, above), shape=(self.n, self.n)).tocsc()
+        below, of_larger = columns.indptr, columns.data
+        # At each vertex, its larger neighbours come first.
+        first, second = np.arange(count) + below[smaller], np.arange(count) + above[1:][larger[of_larger]]
         # Before version 1.17, SciPy's graph searches accept 32-bit indices only.
-        start = np.searchsorted(self.ends[:, 0], np.arange(self.n + 1))
-        return self.ends[:, 1].astype(np.int32), start.astype(np.int32)
+        neighbour, edge = np.empty((2, 2 * count), dtype=np.int32)
+        neighbour[first], neighbour[second] = larger, smaller[of_larger]
+        edge[first], edge[second] = np.arange(count), of_larger
+        return neighbour, edge, (above + below).astype(np.int32)
 
     def distances(self, sources: IntArray, weight: FloatArray, limit: float = np.inf) -> tuple[FloatArray, IntArray]:
         """Distance of each vertex from the nearest source, and its predecessor on the shortest path.
@@ -162,11 +170,10 @@ class EdgeGraph:
         before : (n,) int64
             Negative at sources and where no path exists.
         """
-        head, start = self._rows
-        graph = csr_array((weight, head, start), shape=(self.n, self.n))
-        distance, before, _ = dijkstra(
-            graph, directed=False, indices=sources, return_predecessors=True, min_only=True, limit=limit
-        )
+        neighbour, edge, start = self._rows
+        # With ``directed=False``, SciPy would copy and transpose the graph first, which takes half of the time.
+        graph = csr_array((weight.take(edge), neighbour, start), shape=(self.n, self.n))
+        distance, before, _ = dijkstra(graph, indices=sources, return_predecessors=True, min_only=True, limit=limit)
         return distance, before.astype(np.int64)
 
     def way_back(self, before: IntArray, start: int) -> IntArray:
