@@ -82,17 +82,18 @@ def test_directions_are_those_of_the_recursion():
     inverse[1:, 1:] = np.linalg.inv(stiffness[1:, 1:])
     inverse = np.kron(inverse, np.eye(2))
     steps, changes, gradient = [], [], energy.gradient(w).view(np.float64)
-    while descent.step() and descent.value > 0.5 * first and len(steps) < 6:
+    while descent.step() and descent.value > 0.5 * first and len(steps) < 12:
         there = descent.uv @ [1, 1j]
         step, new = (there - w).view(np.float64), energy.gradient(there).view(np.float64)
-        expected = two_loops(inverse, steps, changes, gradient)
+        expected = two_loops(inverse, steps[-8:], changes[-8:], gradient)
         np.testing.assert_allclose(
             step / np.linalg.norm(step), expected / np.linalg.norm(expected), atol=1e-7 * np.sqrt(n)
         )
         steps.append(step)
         changes.append(new - gradient)
         w, gradient = there, new
-    assert len(steps) >= 3
+    # The first steps are no longer remembered at the end.
+    assert len(steps) > 8
 
 
 def test_rotations_of_the_start_do_not_matter():

@@ -52,6 +52,50 @@ class MetricTuning(NamedTuple):
 _TUNING = MetricTuning()
 
 
+class _Memory:
+    """The last steps (k,) of a descent and what they tell of the second derivatives: L-BFGS in compact form.
+
+    Each step has the displacement, the change of the gradient, and what the metric's inverse makes of this change.
+    """
+
+    def __init__(self, size: int) -> None:
+        most = _TUNING.memory
+        self._steps, self._changes, self._answers = np.zeros((3, most, size))
+        # Products of displacements with changes, whose upper triangle is used, and of changes with answers.
+        self._curvature, self._metric = np.zeros((2, most, most))
+        # Rows of the steps, the oldest first.
+        self._order: list[int] = []
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def clear(self) -> None:
+        """Drop all steps."""
+        self._order.clear()
+
+    def add(self, step: FloatArray, change: FloatArray, answer: FloatArray) -> None:
+        """Remember a step; the oldest one makes room for it."""
+        row = len(self) if len(self) < _TUNING.memory else self._order.pop(0)
+        self._order.append(row)
+        self._steps[row], self._changes[row], self._answers[row] = step, change, answer
+        self._curvature[:, row] = self._steps @ change
+        self._metric[row] = self._metric[:, row] = self._changes @ answer
+
+    def correct(self, gradient: FloatArray, answer: FloatArray) -> FloatArray:
+        """Return ``H g`` for the gradient g, given the answer of the metric's inverse to g."""
+        order = self._order
+        if not order:
+            return answer
+        own = np.ix_(order, order)
+        curvature = np.triu(self._curvature[own])
+        u = np.linalg.solve(curvature, (self._steps @ gradient)[order])
+        inner = np.diag(curvature.diagonal()) + self._metric[own]
+        v = np.linalg.solve(curvature.T, inner @ u - (self._answers @ gradient)[order])
+        by_row = np.zeros((2, _TUNING.memory))
+        by_row[:, order] = v, u
+        return answer + by_row[0] @ self._steps - by_row[1] @ self._answers
+
+
 class LaplacianDescent:
     """Steps that lower an energy from an injective map ``uv`` (n, 2) of about unit size; every map is injective.
 
@@ -69,8 +113,7 @@ class LaplacianDescent:
         w = in_units(uv, 0)
         self._state = self._evaluate(w)
         self._gradient = energy.gradient_of(self._state.derivatives, w.size)
-        # Displacements, changes of the gradient, and what the Laplacian makes of them; a row each.
-        self._memory = np.empty((3, 0, 2 * w.size))
+        self._memory = _Memory(2 * w.size)
         self._measured_at = np.inf
         self._metric: FactoredLaplacian | None = None
         self._answer = np.empty(0)
@@ -91,10 +134,10 @@ class LaplacianDescent:
         if self._metric is None or state.value < _TUNING.fallen * self._measured_at:
             self._measure()
         gradient = self._gradient.view(np.float64)
-        direction = self._direction(gradient)
+        direction = -self._memory.correct(gradient, self._answer)
         slope = float(direction @ gradient)
         if not slope < 0:
-            self._memory = self._memory[:, :0]
+            self._memory.clear()
             direction = -self._answer
             slope = float(direction @ gradient)
             if not slope < 0:
@@ -110,7 +153,7 @@ class LaplacianDescent:
         taken = backtrack(trial, state.value, -slope, longest=min(1.0, limit), tries=HALVINGS)
         if taken is None:
             return False
-        if not self._memory.size:
+        if not len(self._memory):
             taken = extend(trial, taken, limit)
         self._move(taken.state)
         return True
@@ -126,27 +169,15 @@ class LaplacianDescent:
         weight = np.maximum(weight, _TUNING.least_weight * weight.max())
         self._metric = self._laplacian.factor(weigh_edges(self.energy.g, weight))
         self._measured_at = self._state.value
-        self._memory = self._memory[:, :0]
+        self._memory.clear()
         self._answer = self._metric.respond(self._gradient).view(np.float64)
-
-    def _direction(self, gradient: FloatArray) -> FloatArray:
-        """Return ``-H g`` for the gradient g (2 n,)."""
-        S, Y, Z = self._memory
-        if not len(S):
-            return -self._answer
-        SY = S @ Y.T
-        R = np.triu(SY)
-        u = np.linalg.solve(R, S @ gradient)
-        v = np.linalg.solve(R.T, (np.diag(SY.diagonal()) + Y @ Z.T) @ u - Z @ gradient)
-        return -(self._answer + v @ S - u @ Z)
 
     def _move(self, there: NewtonState) -> None:
         """Continue from a state, and remember the step to it."""
         assert self._metric is not None
         gradient = self.energy.gradient_of(there.derivatives, there.w.size)
         answer = self._metric.respond(gradient).view(np.float64)
-        step = np.stack([there.w - self._state.w, gradient - self._gradient]).view(np.float64)
-        if step[0] @ step[1] > 0:
-            new = np.stack([*step, answer - self._answer])[:, None]
-            self._memory = np.concatenate([self._memory[:, -_TUNING.memory + 1 :], new], axis=1)
+        step, change = (there.w - self._state.w).view(np.float64), (gradient - self._gradient).view(np.float64)
+        if step @ change > 0:
+            self._memory.add(step, change, answer - self._answer)
         self._state, self._gradient, self._answer = there, gradient, answer
