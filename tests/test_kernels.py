@@ -123,7 +123,7 @@ _ANY_LENGTH = {
     "sort_edges": {0},
     "number_sides": {0},
     "link_nodes": {2},
-    "gather_part": {4, 8},
+    "gather_part": {4},
     "jacobians": {0},
     "pulls": {5},
     "dirichlet_sweep": {0},

@@ -12,7 +12,7 @@ from quasiharmonic.apps.atlas.packing.board import list_runs
 from quasiharmonic.geometry.coarsening import allocate_round, remove_vertices
 from quasiharmonic.geometry.mesh.topology import find_sides
 from quasiharmonic.surfaces import annulus, disk
-from quasiharmonic.targets.cuts.graph import edge_graph
+from quasiharmonic.targets.cuts.graph import edge_graph, make_room
 from shared.kernel_arguments.registry import ARGUMENTS, Arguments, arguments_of, numbers, soup
 from shared.meshes import tangled
 
@@ -359,8 +359,15 @@ def part_of_disk(rng: np.random.Generator, seeds: int, rings: int) -> Arguments:
     graph = edge_graph(V, F)
     order = np.argsort(F.ravel(), kind="stable")
     start = np.searchsorted(F.ravel()[order], np.arange(len(V) + 1))
-    room = [np.zeros(size, dtype=np.int64) for size in (len(F), len(V), len(graph.ends), F.shape, F.shape, 3)]
-    return start, order // 3, F, graph.side, rng.permutation(len(V))[:seeds], rings, *room
+    return (
+        start,
+        order // 3,
+        F,
+        graph.side,
+        rng.permutation(len(V))[:seeds],
+        rings,
+        *make_room(len(F), len(V), len(graph.ends)),
+    )
 
 
 for seeds, rings in ((1, 1), (1, 3), (9, 2), (40, 1), (0, 2)):

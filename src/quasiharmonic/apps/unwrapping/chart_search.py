@@ -49,7 +49,7 @@ Callback = Callable[[str, int, int], object]
 
 #: The aim for charts of a coarse mesh, whose seams are carried to the surface: this fraction of the permitted stretch.
 AIM_OF_CARRIED = 0.75
-#: On smaller surfaces, threads mostly wait for the interpreter: with two, a search takes a quarter longer than with one.
+#: On smaller surfaces, threads mostly wait for the interpreter: with two, a search takes a quarter longer.
 MANY_TRIANGLES = 200_000
 # Seconds between two calls of the callback while nothing is finished.
 _TICK = 0.25
@@ -174,7 +174,9 @@ def search_charts(
     carried = any(chart.start is not None for chart in charts)
     aim = 1 + (1.0 if not joinable else AIM_OF_CARRIED if carried else _TUNING.aim) * (bound - 1)
     triangles = sum(len(chart.F) for chart in charts)
-    few, many = (len(charts) + round(base + share * triangles**0.5) for base, share in (_TUNING.aim_charts, _TUNING.bound_charts))
+    few, many = (
+        len(charts) + round(base + share * triangles**0.5) for base, share in (_TUNING.aim_charts, _TUNING.bound_charts)
+    )
     keep([*charts])
     flattened = workers.map("flatten", partial(_flatten_first, aim, workers), charts, triangles)
     here = [part for parts in flattened for part in parts]

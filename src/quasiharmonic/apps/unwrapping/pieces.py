@@ -21,7 +21,7 @@ from quasiharmonic.energies.measures import distortion
 from quasiharmonic.geometry.mesh.reference import corner_angles, dot, rest_shapes, surface_area
 from quasiharmonic.geometry.mesh.splitting import fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops, label_components, number_components
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, any_corner, mark, sum_at
 from quasiharmonic.util.progress import heartbeat
 
 #: Edges with a larger angle between the normals are creases. Those of tubes and tori with twelve sides, up to 31°, are
@@ -128,7 +128,7 @@ class _Parts:
         self.tips = defect > _TUNING.defect
         few = np.bincount(part[self.tips], minlength=self.count) <= _TUNING.apexes
         curved = np.bincount(part, np.where(self.tips, 0.0, defect), self.count) > _TUNING.all_defects
-        self.developable = mark(self.count, self.component[self.open_sides.any(axis=1)]) & few & ~curved
+        self.developable = mark(self.count, self.component[any_corner(self.open_sides)]) & few & ~curved
 
     @cached_property
     def split(self) -> IntArray:
@@ -257,9 +257,9 @@ def find_pieces(
     shapes = rest_shapes(V, F)
     area = shapes.m / shapes.m.sum()
     angles, whole = corner_angles(shapes.sides), surface_area(V, F)
-    corners = np.ascontiguousarray(V.T).take(F, axis=1)
-    along = corners - np.roll(corners, -1, axis=2)
-    length = np.sqrt(dot(along, along))
+    corners = np.ascontiguousarray(V.T).take(F.T, axis=1)
+    along = corners - corners[:, (1, 2, 0)]
+    length = np.sqrt(dot(along, along)).T
     found = Pieces(np.full(len(F), -1), np.zeros(F.shape, dtype=np.complex128), np.zeros(hinges.one.size, dtype=bool))
     torus = find_coarse_tori(V, F, hinges, max_stretch, apart)
     flat = _mark_flat(F, hinges, angles, len(V))
@@ -282,7 +282,7 @@ def find_pieces(
         if not chosen.any():
             continue
         outline = np.where(parts.open_sides, length, 0.0)
-        rim: FloatArray = np.bincount(parts.component, outline.sum(axis=1), parts.count).astype(np.float64)
+        rim: FloatArray = np.bincount(parts.component, outline.T.sum(axis=0), parts.count).astype(np.float64)
         if angle == CREASE:
             chosen &= ~parts.rough | (parts.area >= _TUNING.large_share)
             chosen = _drop_scattered(parts, chosen, rim)

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -109,22 +111,29 @@ class EdgeGraph:
         order = np.argsort(self.F.ravel(), kind="stable")
         return np.searchsorted(self.F.ravel()[order], np.arange(self.n + 1)), order // 3
 
+    @cached_property
+    def _room(self) -> list[Any]:
+        """Outputs of `gather_part`, which it uses again: for small parts, new memory would take half of the time."""
+        return make_room(len(self.F), self.n, len(self.ends))
+
     def part_near(self, vertices: IntArray, rings: int) -> tuple[EdgeGraph, IntArray]:
         """Return the graph of the triangles around vertices (k,), and the indices of its edges here.
 
-        Its rim contains only edges of the surface's rim. No path leads to its outer vertices, where triangles of the
-        surface are missing: edges there cost infinitely.
+        The part's rim contains only edges of the surface's rim. No path leads to its outer vertices, where triangles of
+        the surface are missing: edges there cost infinitely. Only one thread may call this at a time.
         """
-        start, star = self._stars
-        triangles, chosen, own = (np.empty(size, dtype=np.int64) for size in (len(self.F), self.n, len(self.ends)))
-        (corners, sides), sizes = np.empty((2, *self.F.shape), dtype=np.int64), np.empty(3, dtype=np.int64)
-        gather_part(start, star, self.F, self.side, vertices, rings, triangles, chosen, own, corners, sides, sizes)
+        _, chosen, own, corners, sides, *_, sizes = self._room
+        gather_part(*self._stars, self.F, self.side, vertices, rings, *self._room)
         many, chosen, own = sizes[0], chosen[: sizes[1]], own[: sizes[2]].copy()
         F, number = corners[:many].copy(), np.ascontiguousarray(sides[:many].T)
-        place = np.empty(self.n, dtype=np.int64)
-        place[chosen] = np.arange(chosen.size)
         graph = EdgeGraph(
-            self.V[chosen], F, place[self.ends[own]], number, self.rim[own], self.length[own], self.cost[own]
+            self.V[chosen],
+            F,
+            np.searchsorted(chosen, self.ends[own]),
+            number,
+            self.rim[own],
+            self.length[own],
+            self.cost[own],
         )
         return graph.without_paths_at(np.bincount(number.ravel()) == 1), own
 
@@ -138,7 +147,7 @@ class EdgeGraph:
         return np.searchsorted(pair_keys(self.ends, self.n), edge_keys(tail, head, self.n))
 
     @cached_property
-    def _rows(self) -> tuple[IntArray, IntArray, IntArray]:
+    def _rows(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
         """Neighbours (2 e,) of each vertex, the edges to them (2 e,), and where those of each vertex start (n + 1,)."""
         count, (smaller, larger) = len(self.ends), self.ends.T
         above = np.searchsorted(smaller, np.arange(self.n + 1))
@@ -195,6 +204,12 @@ def find_distinct(values: IntArray) -> IntArray:
     return values[np.flatnonzero(np.diff(values, prepend=-1))]
 
 
+def make_room(*sizes: int) -> list[Any]:
+    """Return the outputs of `gather_part`, given the numbers of triangles, vertices and edges."""
+    found, among = ([np.zeros(size, dtype=kind) for size in sizes] for kind in (np.int64, np.bool_))
+    return [*found, *np.zeros((2, sizes[0], 3), dtype=np.int64), *among, np.zeros(3, dtype=np.int64)]
+
+
 @compiled
 def gather_part(
     start: IntArray,
@@ -208,12 +223,16 @@ def gather_part(
     edges: IntArray,
     corners: IntArray,
     sides: IntArray,
+    near_triangles: BoolArray,
+    near_vertices: BoolArray,
+    near_edges: BoolArray,
     sizes: IntArray,
 ) -> None:
     """Fill in the triangles in some rings around vertices, their vertices and edges, ascending, and their numbers (3,).
 
     ``corners`` and ``sides`` (f, 3) get the places of their corners and sides among these. The triangles around each
-    vertex are in ``star``, from where ``start`` says; the edges of the sides are ``side`` (3, f).
+    vertex are in ``star``, from where ``start`` says; the edges of the sides are ``side`` (3, f). The masks are all
+    False, before and after.
     """
     near, some = seeds, np.empty(0, dtype=np.int64)
     for _ in range(rings):
