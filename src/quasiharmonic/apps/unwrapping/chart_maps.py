@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -121,7 +122,11 @@ class WorkingChart:
         shapes = rest_shapes(self.piece.V, self.F)
         self.area: FloatArray = shapes.m / shapes.m.sum()
         self.surface_area = float(np.ldexp(self.piece.area, 2 * self.piece.exponent))
-        self._thin = smallest_angles(shapes.sides) < THIN_ANGLE
+
+    @cached_property
+    def _thin(self) -> BoolArray:
+        """Mask (k,) of the triangles with a small angle, on which the stretch has no bound."""
+        return smallest_angles(rest_shapes(self.piece.V, self.F).sides) < THIN_ANGLE
 
     def over(self, bound: float) -> BoolArray:
         """Mask (k,) of the triangles that are stretched beyond the bound."""
@@ -139,7 +144,8 @@ class WorkingChart:
     @property
     def too_long(self) -> BoolArray:
         """Mask (k,) of the triangles that are stretched beyond `WORST_STRETCH` although they are not thin."""
-        return ~self._thin & (self.stretch > WORST_STRETCH)
+        stretched = self.stretch > WORST_STRETCH
+        return ~self._thin & stretched if stretched.any() else stretched
 
     @property
     def crossings(self) -> IntArray:

@@ -156,6 +156,7 @@ class Shrinking:
         # The angle opposite side k is at corner k + 2.
         cotangent = 0.5 / np.tan(angles[(2, 0, 1), :])
         self._stiffness = np.bincount(graph.side.ravel(), cotangent.ravel(), minlength=len(graph.ends))
+        self._total = np.bincount(graph.ends.T.ravel(), np.tile(self._stiffness, 2), minlength=graph.n)
         # A row of the upper triangle is its diagonal entry followed by the edges to larger vertices.
         n, e = graph.n, len(graph.ends)
         indptr = np.arange(n + 1) + np.append(0, np.cumsum(np.bincount(graph.ends[:, 0], minlength=n)))
@@ -181,8 +182,7 @@ class Shrinking:
         values = np.zeros(self.graph.n + len(self.graph.ends))
         between = ~(open_at[tail] | open_at[head])
         values[self._above[between]] = -self._stiffness[between]
-        total = np.bincount(np.concatenate([tail, head]), np.tile(self._stiffness, 2), minlength=self.graph.n)
-        values[self._diagonal] = np.where(open_at, 1.0, total)
+        values[self._diagonal] = np.where(open_at, 1.0, self._total)
         self._solver.factor(values)
         return self._solver.solve(np.where(open_at, 0.0, self.curvature))
 
