@@ -124,6 +124,7 @@ _ANY_LENGTH = {
     "number_sides": {0},
     "link_nodes": {2},
     "gather_part": {4},
+    "walk_stretches": {1},
     "jacobians": {0},
     "pulls": {5},
     "dirichlet_sweep": {0},

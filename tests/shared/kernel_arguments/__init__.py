@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shared.kernel_arguments import maps, surfaces
+from shared.kernel_arguments import cuts, maps, surfaces
 from shared.kernel_arguments.registry import ARGUMENTS
 
-__all__ = ["ARGUMENTS", "maps", "surfaces"]
+__all__ = ["ARGUMENTS", "cuts", "maps", "surfaces"]

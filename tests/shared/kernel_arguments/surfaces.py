@@ -1,4 +1,4 @@
-"""Arguments of kernels for meshes: topology, exact signs, search, coarsening, cuts, packing."""
+"""Arguments of kernels for meshes: topology, exact signs, search, coarsening, packing."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from quasiharmonic import boundary_loops
 from quasiharmonic.apps.atlas.packing.board import list_runs
 from quasiharmonic.geometry.coarsening import allocate_round, remove_vertices
 from quasiharmonic.geometry.mesh.topology import find_sides
-from quasiharmonic.surfaces import annulus, disk
-from quasiharmonic.targets.cuts.graph import edge_graph, make_room
+from quasiharmonic.surfaces import disk
 from shared.kernel_arguments.registry import ARGUMENTS, Arguments, arguments_of, numbers, soup
 from shared.meshes import tangled
 
@@ -351,67 +350,6 @@ def _(rng):
     """Triangles in column-major order, and vertices without triangles."""
     V, F = disk(5)
     return numbers(rng, len(V)), np.asfortranarray(F[: len(F) // 2]), np.zeros(len(V), dtype=bool)
-
-
-def part_of_disk(rng: np.random.Generator, seeds: int, rings: int) -> Arguments:
-    """Some vertices of a mesh, and room for all triangles."""
-    V, F = disk(9)
-    graph = edge_graph(V, F)
-    order = np.argsort(F.ravel(), kind="stable")
-    start = np.searchsorted(F.ravel()[order], np.arange(len(V) + 1))
-    return (
-        start,
-        order // 3,
-        F,
-        graph.side,
-        rng.permutation(len(V))[:seeds],
-        rings,
-        *make_room(len(F), len(V), len(graph.ends)),
-    )
-
-
-for seeds, rings in ((1, 1), (1, 3), (9, 2), (40, 1), (0, 2)):
-    arguments_of("gather_part")(partial(part_of_disk, seeds=seeds, rings=rings))
-
-
-def open_ring(rng: np.random.Generator, costs: str, limit: float, borders: float) -> Arguments:
-    """An annulus between its two boundary loops, with a share of the other edges as further borders."""
-    V, F = annulus(8)
-    graph = edge_graph(V, F)
-    opposite, side = graph.half_edges
-    count = len(graph.ends)
-    cost = {"equal": np.ones(count), "few": rng.integers(1, 4, count).astype(float), "own": graph.cost}[costs]
-    cost[rng.random(count) < 0.05] = np.inf
-    loops = np.sort([loop[0] for loop in boundary_loops(F, len(V))])
-    start, goal = (int(np.flatnonzero(graph.rim[side] & (F.ravel() == vertex))[0]) for vertex in loops)
-    return opposite, side, graph.rim | (rng.random(count) < borders), cost, start, goal, limit, np.zeros_like(side)
-
-
-for costs in ("equal", "few", "own"):
-    for borders in (0.0, 0.01, 0.2):
-        arguments_of("cross_ring")(partial(open_ring, costs=costs, limit=np.inf, borders=borders))
-    arguments_of("cross_ring")(partial(open_ring, costs=costs, limit=0.5, borders=0.0))
-    arguments_of("cross_ring")(partial(open_ring, costs=costs, limit=6.0, borders=0.01))
-
-
-@arguments_of("cross_ring")
-def _(rng):
-    """Both ends at the same border."""
-    opposite, side, border, cost, start, _, limit, path = open_ring(rng, "own", np.inf, 0.01)
-    _, F = annulus(8)
-    (loop,) = (loop for loop in boundary_loops(F, F.max() + 1) if F.ravel()[start] in loop)
-    goal = int(np.flatnonzero(np.isin(F.ravel(), loop[loop != F.ravel()[start]]))[rng.integers(9)])
-    return opposite, side, border, cost, start, goal, limit, path
-
-
-@arguments_of("cross_ring")
-def _(rng):
-    """A start away from all borders."""
-    V, F = disk(3)
-    graph = edge_graph(V, F)
-    opposite, side = graph.half_edges
-    start = int(np.flatnonzero(~graph.rim_vertices[F.ravel()])[0])
-    return opposite, side, graph.rim, graph.cost, start, int(np.flatnonzero(graph.rim[side])[0]), 9.0, 0 * side
 
 
 def hull_points(rng: np.random.Generator, size: int, steps: int) -> Arguments:

@@ -82,44 +82,58 @@ def shorten_cuts(
             if instead is None:
                 tried[name] = exchanges
                 continue
-            exchanged = _exchange(graph, cut, way, instead)
+            exchanged, degrees = _exchange(graph, cut, degree, way, instead)
             if price is not None:
                 if not (now := price(exchanged)) < lowest:
                     tried[name] = exchanges
                     continue
                 lowest = now
-            cut, exchanges = exchanged, exchanges + 1
-            degree = np.bincount(graph.ends[cut].ravel(), minlength=graph.n)
+            cut, degree, exchanges = exchanged, degrees, exchanges + 1
         if exchanges == before:
             break
     return cut
 
 
-def _exchange(graph: EdgeGraph, cut: BoolArray, way: IntArray, instead: IntArray) -> BoolArray:
-    """Replace a stretch; what it alone connected to other cuts is removed, too."""
-    cut = cut.copy()
+def _exchange(
+    graph: EdgeGraph, cut: BoolArray, degree: IntArray, way: IntArray, instead: IntArray
+) -> tuple[BoolArray, IntArray]:
+    """Replace a stretch; what it alone connected to other cuts is removed, too. Returns the cuts and their degrees."""
+    cut, degree = cut.copy(), degree.copy()
+    np.subtract.at(degree, graph.ends[way], 1)
+    others = degree.copy()
     cut[way] = False
-    others = graph.mark_vertices(cut)
+    np.add.at(degree, graph.ends[instead[~cut[instead]]], 1)
     cut[instead] = True
     for node in find_distinct(graph.ends[way[[0, -1]]]).tolist():
-        while others[node] and not graph.rim_vertices[node]:
+        while others[node] and not graph.rim_vertices[node] and degree[node] == 1:
             chosen = np.flatnonzero(cut)
             at_node = chosen[(graph.ends[chosen] == node).any(axis=1)]
-            if at_node.size != 1:
-                break
             cut[at_node] = False
+            degree[graph.ends[at_node[0]]] -= 1
             node = int(graph.ends[at_node[0]].sum()) - node
-    return cut
+    return cut, degree
 
 
 def stretches(graph: EdgeGraph, cut: BoolArray) -> list[IntArray]:
     """Split cuts into their paths between nodes, each as edges in order."""
-    on_rim = graph.rim_vertices
+    chosen = np.flatnonzero(cut)
+    order, last = np.empty((2, chosen.size), dtype=np.int64)
+    count = walk_stretches(graph.ends[chosen], graph.rim_vertices, order, last)
+    last = last[:count]
+    return np.split(chosen[order[: last[-1]]], last[:-1]) if count else []
+
+
+@compiled
+def walk_stretches(ends: IntArray, on_rim: BoolArray, order: IntArray, last: IntArray) -> int:
+    """Fill in the edges (k, 2) of all stretches in order, and where each stretch ends; return their number.
+
+    Nodes are the vertices of the rim, and those that do not have two edges.
+    """
     beside: dict[int, list[tuple[int, int]]] = {}
-    for number, (i, j) in zip(np.flatnonzero(cut).tolist(), graph.ends[cut].tolist(), strict=True):
+    for number, (i, j) in enumerate(ends.tolist()):
         beside.setdefault(i, []).append((number, j))
         beside.setdefault(j, []).append((number, i))
-    found, walked = [], set[int]()
+    walked, size, count = set[int](), 0, 0
     for node, ways in beside.items():
         if len(ways) == 2 and not on_rim[node]:
             continue
@@ -131,8 +145,11 @@ def stretches(graph: EdgeGraph, cut: BoolArray) -> list[IntArray]:
                 number, here = next(step for step in beside[here] if step[0] != way[-1])
                 way.append(number)
             walked.update(way)
-            found.append(np.array(way, dtype=np.int64))
-    return found
+            order[size : size + len(way)] = way
+            size += len(way)
+            last[count] = size
+            count += 1
+    return count
 
 
 def _is_stretch(graph: EdgeGraph, cut: BoolArray, degree: IntArray, way: IntArray) -> bool:

@@ -1,8 +1,9 @@
-/* Kernel of `targets/cuts/shortening.py`. */
+/* Kernels of `targets/cuts/shortening.py`. */
 #include "arguments.h"
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 /* A surface opened at borders. Half-edge and corner 3 t + k of triangle t are those from and at its corner k. */
 typedef struct {
@@ -234,4 +235,81 @@ static PyObject *cross_ring(PyObject *module, PyObject *const *given, Py_ssize_t
     return done_with_integer(a, LENGTH(a), length);
 }
 
-PyMethodDef ring_kernels[] = {KERNEL(cross_ring), END_OF_KERNELS};
+/* Edges of cuts around vertices: those of vertex i are at[start[i]], …, at[start[i + 1] - 1]. */
+typedef struct {
+    const int64_t *ends;
+    const uint8_t *on_rim;
+    int64_t *start, *at;
+} Cuts;
+
+static int is_node(const Cuts *cuts, int64_t vertex)
+{
+    return cuts->on_rim[vertex] || cuts->start[vertex + 1] - cuts->start[vertex] != 2;
+}
+
+static void list_cuts(const Cuts *cuts, Py_ssize_t edges, Py_ssize_t n)
+{
+    int64_t *start = cuts->start;
+    memset(start, 0, (size_t)(n + 1) * sizeof(*start));
+    for (Py_ssize_t j = 0; j < 2 * edges; j++)
+        start[cuts->ends[j]]++;
+    for (Py_ssize_t i = 1; i <= n; i++)
+        start[i] += start[i - 1];
+    for (Py_ssize_t j = 2 * edges - 1; j >= 0; j--)
+        cuts->at[--start[cuts->ends[j]]] = j / 2;
+}
+
+/* Walk from a node along an edge to the next node; the number of edges, which are written to `order`. */
+static int64_t walk(const Cuts *cuts, int64_t node, int64_t edge, uint8_t *walked, int64_t *order)
+{
+    int64_t size = 0, here = node;
+    for (;;) {
+        walked[edge] = 1;
+        order[size++] = edge;
+        here = cuts->ends[2 * edge] + cuts->ends[2 * edge + 1] - here;
+        if (is_node(cuts, here))
+            return size;
+        const int64_t *at = cuts->at + cuts->start[here];
+        edge = at[0] == edge ? at[1] : at[0];
+    }
+}
+
+/* (ends, on_rim, order, last): the edges of all stretches in order, and where each stretch ends; their number. */
+static PyObject *walk_stretches(PyObject *module, PyObject *const *given, Py_ssize_t count)
+{
+    (void)module;
+    Argument a[4];
+    if (!take("walk_stretches", given, count, "qbQQ", a))
+        return NULL;
+    const Py_ssize_t edges = a[2].size, n = a[1].size;
+    if (!fit("walk_stretches", a, LENGTH(a), a[0].size == 2 * edges && a[3].size == edges))
+        return NULL;
+    const Cuts cuts = {a[0].data, a[1].data, malloc((size_t)(n + 1) * sizeof(*cuts.start)),
+                       malloc((size_t)(2 * edges + 1) * sizeof(*cuts.at))};
+    uint8_t *walked = calloc((size_t)edges + 1, 1), *seen = calloc((size_t)n + 1, 1);
+    int64_t *order = a[2].data, *last = a[3].data, size = 0, stretches = 0;
+    const int made = cuts.start && cuts.at && walked && seen;
+    if (made) {
+        Py_BEGIN_ALLOW_THREADS
+        list_cuts(&cuts, edges, n);
+        for (Py_ssize_t j = 0; j < 2 * edges; j++) {
+            const int64_t node = cuts.ends[j];
+            if (seen[node] || !is_node(&cuts, node))
+                continue;
+            seen[node] = 1;
+            for (int64_t k = cuts.start[node]; k < cuts.start[node + 1]; k++)
+                if (!walked[cuts.at[k]]) {
+                    size += walk(&cuts, node, cuts.at[k], walked, order + size);
+                    last[stretches++] = size;
+                }
+        }
+        Py_END_ALLOW_THREADS
+    }
+    free(cuts.start);
+    free(cuts.at);
+    free(walked);
+    free(seen);
+    return made ? done_with_integer(a, LENGTH(a), (Py_ssize_t)stretches) : out_of_memory(a, LENGTH(a));
+}
+
+PyMethodDef ring_kernels[] = {KERNEL(cross_ring), KERNEL(walk_stretches), END_OF_KERNELS};
