@@ -123,6 +123,8 @@ _ANY_LENGTH = {
     "sort_edges": {0},
     "number_sides": {0},
     "link_nodes": {2},
+    "fill_cells": {2},
+    "mark_near": {4},
     "gather_part": {4},
     "walk_stretches": {1},
     "jacobians": {0},

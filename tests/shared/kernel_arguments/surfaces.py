@@ -387,3 +387,26 @@ def _(rng):
     """A board without occupied cells and an empty bitmap."""
     runs = list_runs([np.zeros((2, 2), dtype=bool), np.ones((2, 3), dtype=bool)])
     return np.zeros((8, 8), dtype=bool), 8, *runs, np.zeros(3, dtype=np.int64)
+
+
+def loops_and_cells(rng: np.random.Generator, size: int) -> tuple[Any, ...]:
+    """Closed loops that cross each other, and lead out of the cells."""
+    corners = (rng.uniform(-4, 34, size) + 1j * rng.uniform(-4, 24, size)).astype(np.complex128)
+    return corners, np.roll(corners, -1), np.ones((20, 30), dtype=bool)
+
+
+for size in (0, 1, 3, 40):
+    arguments_of("fill_cells")(partial(loops_and_cells, size=size))
+
+
+@arguments_of("mark_near")
+def _(rng, radius=2.3):
+    tails, heads, cells = loops_and_cells(rng, 9)
+    return tails, heads, radius, 0.5, cells & (rng.random(cells.shape) < 0.1)
+
+
+@arguments_of("mark_near")
+def _(rng):
+    """Points, and a radius of zero."""
+    tails, _, cells = loops_and_cells(rng, 30)
+    return tails, tails, 0.0, 0.5, ~cells

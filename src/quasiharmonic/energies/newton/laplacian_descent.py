@@ -50,6 +50,8 @@ class MetricTuning(NamedTuple):
 
 
 _TUNING = MetricTuning()
+# Factors that keep the upper triangle of a matrix.
+_UPPER = np.triu(np.ones((_TUNING.memory, _TUNING.memory)))
 
 
 class _Memory:
@@ -86,13 +88,14 @@ class _Memory:
         order = self._order
         if not order:
             return answer
-        own = np.ix_(order, order)
-        curvature = np.triu(self._curvature[own])
-        u = np.linalg.solve(curvature, (self._steps @ gradient)[order])
-        inner = np.diag(curvature.diagonal()) + self._metric[own]
-        v = np.linalg.solve(curvature.T, inner @ u - (self._answers @ gradient)[order])
+        row = np.array(order)
+        own = row[:, None], row
+        curvature = self._curvature[own] * _UPPER[: row.size, : row.size]
+        u = np.linalg.solve(curvature, (self._steps @ gradient)[row])
+        inner = curvature.diagonal() * u + self._metric[own] @ u
+        v = np.linalg.solve(curvature.T, inner - (self._answers @ gradient)[row])
         by_row = np.zeros((2, _TUNING.memory))
-        by_row[:, order] = v, u
+        by_row[:, row] = v, u
         return answer + by_row[0] @ self._steps - by_row[1] @ self._answers
 
 

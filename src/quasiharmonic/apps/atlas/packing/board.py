@@ -260,6 +260,8 @@ def find_contact(
 # If the cells of two bitmaps with this radius plus half a distance are disjoint, the shapes are at least this distance
 # apart: the centre of some cell is within half a diagonal of the middle between the closest points.
 HALF_DIAGONAL = sqrt(0.5)
+# Maximum distance between samples of an edge, in cells.
+_SPACING = 0.5
 
 
 def draw(shape: Shape, direction: complex, scale: float, radius: float) -> BoolArray:
@@ -286,8 +288,9 @@ def draw(shape: Shape, direction: complex, scale: float, radius: float) -> BoolA
     w, h = (max(int(side + 2 * radius), 1) for side in ((high - low).real, (high - low).imag))
     shift = complex(w, h) / 2 - (low + high) / 2
     tails, heads = shape.tails * turn + shift, shape.heads * turn + shift
-    found = _fill(tails, heads, h, w)
-    _mark_near(found, tails, heads, radius)
+    found = np.empty((h, w), dtype=np.bool_)
+    fill_cells(tails, heads, found)
+    mark_near(tails, heads, radius, _SPACING, found)
     return found
 
 
@@ -298,8 +301,9 @@ def draw_in_place(shape: Shape, rows: int, columns: int, radius: float) -> BoolA
     lowest, highest = np.minimum(tails.imag, heads.imag), np.maximum(tails.imag, heads.imag)
     leftmost, rightmost = np.minimum(tails.real, heads.real), np.maximum(tails.real, heads.real)
     beside = (highest < -near) | (lowest > rows + near) | (rightmost < -near) | (leftmost > columns + near)
-    found = _fill(tails, heads, rows, columns)
-    _mark_near(found, tails[~beside], heads[~beside], radius)
+    found = np.empty((rows, columns), dtype=np.bool_)
+    fill_cells(tails, heads, found)
+    mark_near(tails[~beside], heads[~beside], radius, _SPACING, found)
     return found
 
 
@@ -336,8 +340,10 @@ def count_cells(size: tuple[int, int], texels: float) -> tuple[int, int]:
     return int(size[0] / texels * (1 + 1e-12)), int(size[1] / texels * (1 + 1e-12))
 
 
-def _fill(tails: ComplexArray, heads: ComplexArray, h: int, w: int) -> BoolArray:
-    """Cells around whose centres the edges wind."""
+@compiled
+def fill_cells(tails: ComplexArray, heads: ComplexArray, cells: BoolArray) -> None:
+    """Set the cells (h, w) to whether the edges (e,) wind around their centres."""
+    h, w = cells.shape
     up = heads.imag > tails.imag
     lower, upper = np.where(up, tails, heads), np.where(up, heads, tails)
     # Rows of centres y with lower ≤ y < upper.
@@ -346,26 +352,25 @@ def _fill(tails: ComplexArray, heads: ComplexArray, h: int, w: int) -> BoolArray
     row = first[edge] + step
     ahead = upper[edge] - lower[edge]
     x = lower.real[edge] + (row + 0.5 - lower.imag[edge]) * (ahead.real / ahead.imag)
-    column = np.clip(np.ceil(x - 0.5).astype(np.int64), 0, w)
+    column = np.clip(np.ceil(x - 0.5), 0, w).astype(np.int64)
     change = np.bincount(row * (w + 1) + column, np.where(up[edge], 1.0, -1.0), h * (w + 1))
-    return np.asarray(np.cumsum(change.reshape(h, w + 1), axis=1)[:, :w] != 0)
+    cells[:] = np.cumsum(change.reshape(h, w + 1), axis=1)[:, :w] != 0
 
 
-def _mark_near(cells: BoolArray, tails: ComplexArray, heads: ComplexArray, radius: float) -> None:
-    """Mark the cells whose centres are within a distance of an edge."""
-    # Maximum distance between samples of an edge, in cells.
-    spacing = 0.5
+@compiled
+def mark_near(tails: ComplexArray, heads: ComplexArray, radius: float, spacing: float, cells: BoolArray) -> None:
+    """Mark the cells (h, w) whose centres are within a distance of an edge, by samples at most ``spacing`` apart."""
     h, w = cells.shape
     count = np.maximum(np.ceil(np.abs(heads - tails) / spacing), 1).astype(np.int64)
     edge, step = enumerate_each(count)
     samples = tails[edge] + (heads - tails)[edge] * (step / count[edge])
     # Every point of an edge is at most half the spacing from a sample.
     reach = radius**2 + spacing**2 / 4
+    k = int(sqrt(reach)) + 2
+    inside = (samples.imag > -k) & (samples.imag < h + k) & (samples.real > -k) & (samples.real < w + k)
+    samples = samples[inside]
     i, j = np.floor(samples.imag).astype(np.int64), np.floor(samples.real).astype(np.int64)
     y, x = samples.imag - i, samples.real - j
-    k = int(sqrt(reach)) + 2
-    inside = (i > -k) & (i < h + k) & (j > -k) & (j < w + k)
-    i, j, y, x = i[inside], j[inside], y[inside], x[inside]
     padded = np.zeros((h + 4 * k, w + 4 * k), dtype=bool)
     flat, place = padded.ravel(), (i + 2 * k) * padded.shape[1] + j + 2 * k
     offset = np.arange(-k + 1, k)[:, None]

@@ -4,6 +4,7 @@
 #define FILES(with) \
     with(contact) \
     with(deformation) \
+    with(drawing) \
     with(field) \
     with(guard) \
     with(laplacian) \
