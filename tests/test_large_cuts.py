@@ -67,6 +67,18 @@ class TestLevels:
         outer = ~np.isin(graph.ends[own], ring).all(axis=1)
         assert np.array_equal(np.isinf(part.cost), outer)
 
+    def test_parts_stay_when_others_are_taken(self):
+        """The graph uses its memory again; a part of one triangle could be a view of it."""
+        V, F = surfaces.disk(5)
+        V, F = np.concatenate([V, [[9, 9], [10, 9], [9, 10]]]), np.concatenate([F, [[len(V), len(V) + 1, len(V) + 2]]])
+        graph = edge_graph(V, F)
+        part, own = graph.part_near(np.array([len(V) - 1]), 1)
+        before = [array.copy() for array in (part.V, part.F, part.ends, part.side, part.cost, own)]
+        graph.part_near(np.array([0]), 3)
+        assert len(part.F) == 1
+        for then, now in zip(before, (part.V, part.F, part.ends, part.side, part.cost, own), strict=True):
+            assert np.array_equal(then, now)
+
     @pytest.mark.long
     def test_a_large_torus(self):
         """The inner equator and a ring are nearly the shortest cuts."""

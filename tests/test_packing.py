@@ -391,3 +391,21 @@ def test_hulls_have_the_corners_that_qhull_finds(size, steps, quarters, seed):
 def test_hulls_keep_the_ends_of_sides_that_are_upright_up_to_rounding():
     z = np.array([1j, 1e-17, 2e-17 + 0.5j, 1 + 0.5j])
     assert set(convex_hull(z)) == {1j, 1e-17, 1 + 0.5j}
+
+
+@pytest.mark.parametrize("far", [1e6, 1e30, 1e308])
+def test_occupied_places_far_away_are_named(far):
+    triangle = np.array([[0, 0], [1, 0], [0, 1.0]]), np.array([[0, 1, 2]])
+    with pytest.raises(ValueError, match="occupied has vertices 0, 1 more than 100,000 textures away"):
+        pack_charts([triangle], resolution=64, occupied=([[-far, 0.3], [far, 0.31], [0, 0.4]], [[0, 1, 2]]))
+
+
+def test_occupied_places_cover_the_texture_from_far_away():
+    """A triangle's long sides lead through the texture; only its lower part stays free."""
+    triangle = np.array([[0, 0], [1, 0], [0, 1.0]]), np.array([[0, 1, 2]])
+    packings = [
+        pack_charts([triangle], resolution=64, occupied=([[-far, 0.5], [far, 0.5], [0, far]], [[0, 1, 2]]))
+        for far in (1e2, 1e4)
+    ]
+    assert packings[1].texels_per_unit == pytest.approx(packings[0].texels_per_unit, rel=0.03)
+    assert packings[1].texels_per_unit < 64

@@ -5,6 +5,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
+from quasiharmonic.geometry.mesh.splitting import renumber
 from quasiharmonic.geometry.mesh.topology import are_sides, find_pairs, find_sides, mark_sides
 from quasiharmonic.surfaces import disk
 from shared.kernel_arguments.registry import soup
@@ -62,3 +63,17 @@ def test_sides_at_given_edges(name):
     assert are_sides(pairs, F, n).tolist() == [tuple(sorted(pair)) in sides for pair in pairs.tolist()]
     assert not mark_sides(F, pairs[:0], n).any()
     assert not are_sides(pairs[:0], F, n).size
+
+
+@pytest.mark.parametrize("gap", [0, 10**6])
+def test_parts_are_numbered_in_the_order_of_their_vertices(gap):
+    rng = np.random.default_rng(4)
+    F = rng.permutation(300)[soup(rng, 30, 40)]
+    # Every vertex has one or two fans.
+    split = 2 * F + rng.integers(0, 2, F.shape) + gap * (F > 200)
+    own, corner = renumber(split, F)
+    of = split.ravel()[corner]
+    assert np.array_equal(of[own], split)
+    assert np.array_equal(F.ravel()[corner][own], F)
+    assert len(set(of.tolist())) == len(of)
+    assert (np.diff(F.ravel()[corner]) >= 0).all()

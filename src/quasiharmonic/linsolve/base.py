@@ -103,7 +103,9 @@ class ResidualTest:
 @cache
 def _random_signs(exponent: int) -> FloatArray:
     """Return 2^exponent random signs, always the same ones."""
-    return np.random.default_rng(0).integers(2, size=1 << exponent) * np.float64(2) - 1
+    signs = np.random.default_rng(0).integers(2, size=1 << exponent) * np.float64(2) - 1
+    signs.flags.writeable = False
+    return signs
 
 
 @compiled

@@ -502,4 +502,6 @@ class UnwrapOptions(Options):
         None, "end the search for few charts after this many seconds, and keep the best charts", check=seconds
     )
     callback: Callable[[Any], object] | None = option(None, check=function)
-    jobs: int | None = option(None, "number of threads (default: all cores)", check=positive_or_none)
+    jobs: int | None = option(
+        None, "number of threads from 200,000 triangles on (default: all cores)", check=positive_or_none
+    )

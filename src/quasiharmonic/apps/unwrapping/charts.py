@@ -89,7 +89,7 @@ def find_charts(
     callback : callable, optional
         Called with the phase, the number of finished parts and the number of all parts; may raise an exception.
     jobs : int, optional
-        Number of threads; by default the number of cores.
+        Number of threads for many triangles (`MANY_TRIANGLES`); by default the number of cores.
 
     Returns
     -------

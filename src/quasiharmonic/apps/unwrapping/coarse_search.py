@@ -122,7 +122,7 @@ class CoarseSearch:
 
     def start(self, charts: list[WorkingChart]) -> None:
         """Give initial maps to charts of the surface, where the coarse ones give an injective map."""
-        self._workers.map("start", self._start, charts, len(self._V))
+        self._workers.map("start", self._start, charts, sum(len(chart.F) for chart in charts))
 
     def _prolong(self, rounds: list[list[Removal]]) -> None:
         """Place vertices that the coarse mesh lacks, round after round, if their ring is in a chart."""

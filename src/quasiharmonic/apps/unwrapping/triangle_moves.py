@@ -203,6 +203,7 @@ class _SeamedCharts:
         # The mesh of all charts without seams.
         T = own[self.F]
         near = np.flatnonzero(triangles_near(T, mark(present.size, *(own[rim] for rim in self.rims)), _RINGS))
+        # Sides at the border of these triangles have no other side, so their prices do not matter.
         graph = edge_graph(points, T[near], self.cost[near])
         self.price = np.zeros(T.shape)
         self.price[near] = graph.cost[graph.side.T]

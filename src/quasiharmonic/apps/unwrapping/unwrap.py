@@ -169,7 +169,8 @@ def unwrap(V: ArrayLike, F: ArrayLike, **options: Unpack[UnwrapKeywords]) -> Unw
     callback : callable, optional
         Called with an `UnwrapStep`, at least every half second. Exceptions propagate.
     jobs : int, optional
-        Number of threads for models of many triangles. Default: all cores. The result does not depend on it.
+        Number of threads for models of 200,000 triangles or more; smaller models use one. Default: all cores. The
+        result does not depend on it.
 
     Returns
     -------

@@ -43,6 +43,8 @@ from quasiharmonic.util.arrays import (
     vertex_array,
 )
 
+# Numbers of vertices are sorted if their range is larger than this multiple of the number of corners.
+_GAPS = 4
 #: Weights of old vertices in a new vertex.
 Shares = dict[int, float]
 
@@ -93,6 +95,10 @@ def renumber(split: IntArray, F: IntArray) -> tuple[IntArray, IntArray]:
     vertices and without gaps keeps its numbers. Also returns one corner of every vertex, as an index into the flattened
     triangles.
     """
+    split = split - split.min(initial=0)
+    if split.max(initial=0) > _GAPS * split.size:
+        # A small part of a large mesh.
+        split = np.unique(split.ravel(), return_inverse=True)[1].reshape(-1, 3)
     corner = np.full(int(split.max(initial=-1)) + 1, -1)
     # The first corner of each vertex is written last.
     corner[split.ravel()[::-1]] = np.arange(split.size)[::-1]

@@ -125,7 +125,7 @@ class EdgeGraph:
         _, chosen, own, corners, sides, *_, sizes = self._room
         gather_part(*self._stars, self.F, self.side, vertices, rings, *self._room)
         many, chosen, own = sizes[0], chosen[: sizes[1]], own[: sizes[2]].copy()
-        F, number = corners[:many].copy(), np.ascontiguousarray(sides[:many].T)
+        F, number = corners[:many].copy(), sides[:many].T.copy()
         graph = EdgeGraph(
             self.V[chosen],
             F,
@@ -230,9 +230,9 @@ def gather_part(
 ) -> None:
     """Fill in the triangles in some rings around vertices, their vertices and edges, ascending, and their numbers (3,).
 
-    ``corners`` and ``sides`` (f, 3) get the places of their corners and sides among these. The triangles around each
-    vertex are in ``star``, from where ``start`` says; the edges of the sides are ``side`` (3, f). The masks are all
-    False, before and after.
+    Each of the given vertices has triangles. ``corners`` and ``sides`` (f, 3) get the places of their corners and sides
+    among these. The triangles around each vertex are in ``star``, from where ``start`` says; the edges of the sides are
+    ``side`` (3, f). The masks are all False, before and after.
     """
     near, some = seeds, np.empty(0, dtype=np.int64)
     for _ in range(rings):

@@ -33,10 +33,14 @@ from quasiharmonic.util.arrays import (
     count_of,
     describe,
     map_array,
+    reject,
     to_complex,
     to_points,
     triangle_array,
 )
+
+# Largest distance of occupied places from the texture, in textures. Edges to places farther away cannot be drawn.
+_FARTHEST = 100_000
 
 
 @dataclass(frozen=True)
@@ -204,6 +208,9 @@ def pack_charts(
         )
     if occupied is not None:
         at = map_array("occupied", occupied[0])
+        remedy = "move these charts, or leave them out"
+        far = np.flatnonzero(np.abs(at).max(axis=1) > _FARTHEST)
+        reject(far, "vertex", "vertices", f"occupied has {{}} more than {_FARTHEST:,} textures away: {remedy}")
         around = Occupied(make_shape(at * size, triangle_array(occupied[1], len(at))), size)
         layout = find_layout_around(around, shapes, into, wanted)
         if layout is None:

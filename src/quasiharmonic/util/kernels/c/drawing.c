@@ -9,9 +9,23 @@ typedef struct {
     double x, y;
 } Point;
 
-static double clipped(double value, double most)
+/* A row or column: the number itself where it is one of so many, else the nearest; 0 for NaN. */
+static int64_t clipped(double value, Py_ssize_t most)
 {
-    return value < 0 ? 0 : value > most ? most : value;
+    return value > 0 ? value < (double)most ? (int64_t)value : most : 0;
+}
+
+/* Cut off the part of a parameter's range [range[0], range[1]] in which start + parameter * along is outside of [low, high]. */
+static void clip(double start, double along, double low, double high, double range[2])
+{
+    const double one = (low - start) / along, other = (high - start) / along;
+    if (along == 0) {
+        if (!(start >= low && start <= high))
+            range[1] = -1;
+        return;
+    }
+    range[0] = fmax(range[0], fmin(one, other));
+    range[1] = fmin(range[1], fmax(one, other));
 }
 
 /* (tails, heads, cells): the cells around whose centres edges wind. */
@@ -33,11 +47,11 @@ static PyObject *fill_cells(PyObject *module, PyObject *const *given, Py_ssize_t
     for (Py_ssize_t e = 0; e < a[0].size; e++) {
         const int up = heads[e].y > tails[e].y;
         const Point lower = up ? tails[e] : heads[e], upper = up ? heads[e] : tails[e];
-        const int64_t end = (int64_t)clipped(ceil(upper.y - 0.5), (double)h);
+        const int64_t end = clipped(ceil(upper.y - 0.5), h);
         const double slope = (upper.x - lower.x) / (upper.y - lower.y);
-        for (int64_t row = (int64_t)clipped(ceil(lower.y - 0.5), (double)h); row < end; row++) {
+        for (int64_t row = clipped(ceil(lower.y - 0.5), h); row < end; row++) {
             const double x = lower.x + ((double)row + 0.5 - lower.y) * slope;
-            change[row * (w + 1) + (int64_t)clipped(ceil(x - 0.5), (double)w)] += up ? 1 : -1;
+            change[row * (w + 1) + clipped(ceil(x - 0.5), w)] += up ? 1 : -1;
         }
     }
     for (Py_ssize_t i = 0; i < h; i++)
@@ -50,7 +64,8 @@ static PyObject *fill_cells(PyObject *module, PyObject *const *given, Py_ssize_t
     return done(a, LENGTH(a));
 }
 
-/* (tails, heads, radius, spacing, cells): mark the cells whose centres are within a distance of an edge. */
+/* (tails, heads, radius, spacing, cells): mark the cells whose centres are within a distance of an edge; edges of 2^31
+ * samples or more, or that are not finite, mark none. */
 static PyObject *mark_near(PyObject *module, PyObject *const *given, Py_ssize_t count)
 {
     (void)module;
@@ -70,9 +85,15 @@ static PyObject *mark_near(PyObject *module, PyObject *const *given, Py_ssize_t 
     for (Py_ssize_t e = 0; e < a[0].size; e++) {
         const double dx = heads[e].x - tails[e].x, dy = heads[e].y - tails[e].y;
         const double samples = fmax(ceil(hypot(dx, dy) / spacing), 1);
-        for (double s = 0; s < samples; s++) {
-            const double x = tails[e].x + dx * (s / samples), y = tails[e].y + dy * (s / samples);
-            /* Samples far from the cells, and those that are not finite, mark none. */
+        double range[2] = {0, 1};
+        clip(tails[e].x, dx, (double)-k, (double)(w + k), range);
+        clip(tails[e].y, dy, (double)-k, (double)(h + k), range);
+        if (!(samples < INT32_MAX && range[0] <= range[1]))
+            continue;
+        /* One sample more at both ends, because of rounding. */
+        const int64_t last = clipped(ceil(range[1] * samples) + 1, (Py_ssize_t)samples - 1);
+        for (int64_t s = clipped(floor(range[0] * samples) - 1, (Py_ssize_t)samples - 1); s <= last; s++) {
+            const double part = (double)s / samples, x = tails[e].x + dx * part, y = tails[e].y + dy * part;
             if (!(x > (double)-k && x < (double)(w + k) && y > (double)-k && y < (double)(h + k)))
                 continue;
             const int64_t i = (int64_t)floor(y), j = (int64_t)floor(x);
