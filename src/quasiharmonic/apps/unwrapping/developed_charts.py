@@ -15,7 +15,7 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.packing.shapes import convex_hull, find_smallest_box
 from quasiharmonic.apps.unwrapping.chart import Chart, cut_out_chart
-from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges, ahead
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, KEPT_COST, UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.layout import LayoutChoice
 from quasiharmonic.apps.unwrapping.pieces import Pieces, find_pieces
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
@@ -23,7 +23,7 @@ from quasiharmonic.apps.unwrapping.unrolling import SAME, meet
 from quasiharmonic.geometry.exact.loops import check_loops
 from quasiharmonic.geometry.mesh.reference import surface_area
 from quasiharmonic.geometry.mesh.splitting import fans
-from quasiharmonic.geometry.mesh.topology import boundary_loops, group_by_label
+from quasiharmonic.geometry.mesh.topology import ahead, boundary_loops, group_by_label
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, to_points
 
 # Rounds with a larger loss than this are left out if there are too many charts to compare: the choice between lists of

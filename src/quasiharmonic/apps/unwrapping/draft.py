@@ -20,7 +20,7 @@ from quasiharmonic.apps.unwrapping.straightening import Strip
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.apps.unwrapping.unrolling import covers_once
 from quasiharmonic.geometry.mesh.splitting import fans
-from quasiharmonic.geometry.mesh.topology import edge_keys, find_pairs, mark_sides, number_components
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_pairs, mark_sides, number_components, rank_labels
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, find_exponent, mark
 
 # Largest and smallest bound in radians on the angle between a triangle and the plane of its chart.
@@ -205,7 +205,7 @@ def _join(
         outline[a[chosen]] -= 2 * common[chosen]
         new = np.arange(len(cross))
         new[b[chosen]] = a[chosen]
-        new = _rank(new)
+        new = rank_labels(new)
         cross, outline, label = _sum_rows(cross, new), np.bincount(new, outline).astype(np.float64), new[label]
         mean, inclined = _scale_to_one(cross), np.zeros(len(cross))
         np.maximum.at(inclined, label, _angles(middle, mean[label]) + radius)
@@ -262,11 +262,6 @@ def _list_pairs(a: IntArray, b: IntArray, common: FloatArray) -> tuple[IntArray,
     _, first, at = np.unique(key, return_index=True, return_inverse=True)
     total: FloatArray = np.bincount(at, common[apart]).astype(np.float64)
     return a[apart][first], b[apart][first], total
-
-
-def _rank(label: IntArray) -> IntArray:
-    """Return labels without gaps, given labels that are elements of their sets."""
-    return (np.cumsum(label == np.arange(label.size)) - 1)[label]
 
 
 def _sum_rows(values: FloatArray, label: IntArray) -> FloatArray:

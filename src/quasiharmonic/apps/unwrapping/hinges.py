@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quasiharmonic.geometry.mesh.reference import cross, dot
-from quasiharmonic.geometry.mesh.topology import find_pairs
+from quasiharmonic.geometry.mesh.topology import ahead, find_pairs, previous_sides
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray
 
 #: Triangles on the two sides of an edge with at least this cost factor stay together, such as those of a polygon.
@@ -28,16 +28,6 @@ _FLAT_ANGLE = np.pi / 180
 _BITS = 30
 # Triangles with a smaller share of the area belong to no flat face: their planes are arbitrary.
 _LEAST_AREA = 1e-9
-
-
-def ahead(side: IntArray) -> IntArray:
-    """Return the next side of the same triangle."""
-    return side + 1 - 3 * (side % 3 == 2)
-
-
-def previous_sides(side: IntArray) -> IntArray:
-    """Return the previous side of the same triangle."""
-    return side - 1 + 3 * (side % 3 == 0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quasiharmonic.apps.unwrapping.hinges import ahead, previous_sides
-from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, label_components, opposite_sides
+from quasiharmonic.geometry.mesh.topology import (
+    ahead,
+    edge_keys,
+    find_sides,
+    first_of_pairs,
+    label_components,
+    opposite_sides,
+    previous_sides,
+)
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, mark, repeat_each
 
 
@@ -103,7 +110,7 @@ def join_sheets(points: FloatArray, F: IntArray, corners: IntArray, area: FloatA
     side = find_sides(F, len(points))[1]
     opposite, side = opposite_sides(side), side.ravel()
     count = np.bincount(side)
-    first = np.flatnonzero(opposite > np.arange(side.size))
+    first = first_of_pairs(opposite)
     by_edge = np.empty(count.size, dtype=np.int64)
     by_edge[side[first]] = first
     one = by_edge[count == 2]

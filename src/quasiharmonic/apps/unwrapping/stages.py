@@ -241,7 +241,9 @@ def _search(task: Task, draft: Draft, density: float | None) -> list[Chart]:
     most = wanted.max_charts
     straight, strips = list[Chart](), list[Strip]()
     if wanted.straighten:
-        straight, strips = straighten_strips(points, cleaned.F, rules.cost, rules.uv_cuts, task.bound, most)
+        straight, strips = straighten_strips(
+            points, cleaned.F, rules.hinges, rules.cost, rules.uv_cuts, task.bound, most
+        )
     rest = ~mark(len(cleaned.F), *(chart.triangles for chart in straight))
     draft.rows, draft.others, draft.strips = np.flatnonzero(rest), straight, strips
     divide = _make_divide(task, density)

@@ -14,7 +14,7 @@ import numpy as np
 
 from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
 from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
-from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges, find_hinges
+from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST, Hinges
 from quasiharmonic.apps.unwrapping.pieces import CREASE
 from quasiharmonic.apps.unwrapping.unrolling import find_forest, lay_along
 from quasiharmonic.geometry.mesh.reference import corner_angles, rest_shapes
@@ -76,7 +76,13 @@ class _GridPlaces(NamedTuple):
 
 
 def straighten_strips(
-    V: FloatArray, F: IntArray, cost: FloatArray, cut: IntArray | None, bound: float, max_charts: int | None = None
+    V: FloatArray,
+    F: IntArray,
+    hinges: Hinges,
+    cost: FloatArray,
+    cut: IntArray | None,
+    bound: float,
+    max_charts: int | None = None,
 ) -> tuple[list[Chart], list[Strip]]:
     """Lay out the strips of a surface as rectangles.
 
@@ -86,6 +92,7 @@ def straighten_strips(
     ----------
     V : (n, 3) float64
     F : (f, 3) int64
+    hinges : Hinges
     cost : (f, 3) float64
         Factors on the cost of seams; see `find_charts`.
     cut : (l, 2) int64, optional
@@ -102,7 +109,6 @@ def straighten_strips(
     strips : list of Strip
         These and the strips that exceed the bound, ordered by first triangle.
     """
-    hinges = find_hinges(V, F)
     apart = hinges.touch(cost <= DEMANDED_COST)
     if cut is not None:
         apart |= np.isin(pair_keys(hinges.ends(F), len(V)), pair_keys(cut, len(V)))

@@ -16,6 +16,7 @@ from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.hinges import DEMANDED_COST, UNDIVIDED_COST
 from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.mesh.reference import rest_shapes
+from quasiharmonic.geometry.mesh.topology import ahead
 from quasiharmonic.targets.cuts.graph import edge_graph, triangles_near
 from quasiharmonic.util.arrays import ComplexArray, IntArray, invert_indices, mark, to_complex, to_points
 
@@ -187,7 +188,7 @@ class _SeamedCharts:
         self.changed = np.zeros(len(charts), dtype=bool)
         self.z = np.concatenate([_positions(chart) for chart in charts])
         self.rims = [np.concatenate(chart.piece.loops) + first for chart, first in zip(charts, start, strict=False)]
-        self.ahead = np.arange(self.F.size).reshape(-1, 3).take((1, 2, 0), axis=1).ravel()
+        self.ahead = ahead(np.arange(self.F.size))
         shapes = rest_shapes(self.V, self.F)
         self.sides = shapes.unit * shapes.sides
         self._pair_sides()

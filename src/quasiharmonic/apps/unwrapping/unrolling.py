@@ -11,12 +11,12 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from quasiharmonic.apps.unwrapping.chart import Chart, cut_out_chart
-from quasiharmonic.apps.unwrapping.hinges import Hinges, ahead, find_hinges
+from quasiharmonic.apps.unwrapping.hinges import Hinges, find_hinges
 from quasiharmonic.geometry.exact.certificate import certify, inverted_triangles
 from quasiharmonic.geometry.exact.loops import simple_loops
 from quasiharmonic.geometry.mesh.reference import area_vectors, rest_frames
 from quasiharmonic.geometry.mesh.splitting import fans
-from quasiharmonic.geometry.mesh.topology import boundary_loops, edge_keys, group_by_label
+from quasiharmonic.geometry.mesh.topology import ahead, boundary_loops, edge_keys, group_by_label
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, to_points
 
 #: Two sides of an edge are at one place if their ends are at most this fraction of its length apart.

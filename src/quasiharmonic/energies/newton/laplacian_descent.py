@@ -55,7 +55,7 @@ _UPPER = np.triu(np.ones((_TUNING.memory, _TUNING.memory)))
 
 
 class _Memory:
-    """The last steps (k,) of a descent and what they tell of the second derivatives: L-BFGS in compact form.
+    """The last steps (k,) of a descent, which estimate its second derivatives: L-BFGS in compact form.
 
     Each step has the displacement, the change of the gradient, and what the metric's inverse makes of this change.
     """

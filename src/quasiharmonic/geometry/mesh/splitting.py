@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from quasiharmonic.geometry.mesh.topology import (
+    ahead,
     are_collapsed,
     are_sides,
     edge_keys,
@@ -78,12 +79,9 @@ def fans(
         joined &= ~(cut.ravel()[one] | cut.ravel()[other])
     if not joined.all():
         one, other = one[joined], other[joined]
-    ahead = np.arange(F.size).reshape(-1, 3).take((1, 2, 0), axis=1).ravel()
     # The half-edge of a corner begins there. Joining two half-edges identifies the start of each with the end of the
     # other.
-    split = number_components(
-        np.concatenate([one, ahead.take(one)]), np.concatenate([ahead.take(other), other]), F.size
-    )
+    split = number_components(np.concatenate([one, ahead(one)]), np.concatenate([ahead(other), other]), F.size)
     component = number_components(one // 3, other // 3, len(F))
     return split.reshape(-1, 3), component
 

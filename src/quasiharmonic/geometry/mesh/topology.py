@@ -125,7 +125,7 @@ def find_pairs(F: IntArray) -> tuple[IntArray, IntArray]:
     Side 3 t + k runs from corner k of triangle t to the next.
     """
     opposite = opposite_sides(find_sides(F, int(F.max(initial=-1)) + 1)[1])
-    one = np.flatnonzero(opposite > np.arange(opposite.size))
+    one = first_of_pairs(opposite)
     return one, opposite[one]
 
 
@@ -139,6 +139,21 @@ def opposite_sides(side: IntArray) -> IntArray:
     if not find_opposite(side, edges, opposite):
         check_range("side", side, edges)
     return opposite
+
+
+def first_of_pairs(opposite: IntArray) -> IntArray:
+    """Return the smaller side of each pair, ascending, given the `opposite_sides` (3 f,)."""
+    return np.flatnonzero(opposite > np.arange(opposite.size))
+
+
+def ahead(side: IntArray) -> IntArray:
+    """Return the next side of the same triangle."""
+    return side + 1 - 3 * (side % 3 == 2)
+
+
+def previous_sides(side: IntArray) -> IntArray:
+    """Return the previous side of the same triangle."""
+    return side - 1 + 3 * (side % 3 == 0)
 
 
 @compiled
@@ -309,9 +324,12 @@ def number_components(tail: IntArray, head: IntArray, n: int) -> IntArray:
 
     The arguments are those of `label_components`.
     """
-    label = label_components(tail, head, n)
-    # Labels are smallest nodes, so their rank is the order of appearance.
-    return (np.cumsum(label == np.arange(n)) - 1).take(label)
+    return rank_labels(label_components(tail, head, n))
+
+
+def rank_labels(label: IntArray) -> IntArray:
+    """Return labels without gaps, (n,) int64, in the same order, given labels that are elements of their sets."""
+    return (np.cumsum(label == np.arange(label.size)) - 1).take(label)
 
 
 def group_by_label(label: IntArray) -> list[IntArray]:

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from quasiharmonic.geometry.coarsening import has_marked_corner, mark_rings
 from quasiharmonic.geometry.mesh.reference import area_vectors, cross, dot, surface_area
-from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, opposite_sides, pair_keys
+from quasiharmonic.geometry.mesh.topology import edge_keys, find_sides, first_of_pairs, opposite_sides, pair_keys
 from quasiharmonic.util.arrays import (
     BoolArray,
     FloatArray,
@@ -102,7 +102,7 @@ class EdgeGraph:
     def list_pairs(self) -> tuple[IntArray, IntArray, IntArray]:
         """Return the two triangles at each interior edge, and the edge; (i,) int64 each, by the first triangle."""
         opposite, side = self.half_edges
-        one = np.flatnonzero(opposite > np.arange(opposite.size))
+        one = first_of_pairs(opposite)
         return one // 3, opposite[one] // 3, side[one]
 
     @cached_property

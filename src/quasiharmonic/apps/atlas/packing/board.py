@@ -287,23 +287,19 @@ def draw(shape: Shape, direction: complex, scale: float, radius: float) -> BoolA
     low, high = (complex(f(hull.real), f(hull.imag)) for f in (np.min, np.max))
     w, h = (max(int(side + 2 * radius), 1) for side in ((high - low).real, (high - low).imag))
     shift = complex(w, h) / 2 - (low + high) / 2
-    tails, heads = shape.tails * turn + shift, shape.heads * turn + shift
-    found = np.empty((h, w), dtype=np.bool_)
-    fill_cells(tails, heads, found)
-    mark_near(tails, heads, radius, _SPACING, found)
-    return found
+    return _draw_edges(shape.tails * turn + shift, shape.heads * turn + shift, (h, w), radius)
 
 
 def draw_in_place(shape: Shape, rows: int, columns: int, radius: float) -> BoolArray:
     """Cells (rows, columns) of a rectangle at the origin within a distance of a shape; the unit is a cell."""
-    near = radius + 1
-    tails, heads = shape.tails, shape.heads
-    lowest, highest = np.minimum(tails.imag, heads.imag), np.maximum(tails.imag, heads.imag)
-    leftmost, rightmost = np.minimum(tails.real, heads.real), np.maximum(tails.real, heads.real)
-    beside = (highest < -near) | (lowest > rows + near) | (rightmost < -near) | (leftmost > columns + near)
-    found = np.empty((rows, columns), dtype=np.bool_)
+    return _draw_edges(shape.tails, shape.heads, (rows, columns), radius)
+
+
+def _draw_edges(tails: ComplexArray, heads: ComplexArray, size: tuple[int, int], radius: float) -> BoolArray:
+    """Cells (h, w) within a distance of the edges (e,) of a shape, or inside of it."""
+    found = np.empty(size, dtype=np.bool_)
     fill_cells(tails, heads, found)
-    mark_near(tails[~beside], heads[~beside], radius, _SPACING, found)
+    mark_near(tails, heads, radius, _SPACING, found)
     return found
 
 
@@ -361,12 +357,16 @@ def fill_cells(tails: ComplexArray, heads: ComplexArray, cells: BoolArray) -> No
 def mark_near(tails: ComplexArray, heads: ComplexArray, radius: float, spacing: float, cells: BoolArray) -> None:
     """Mark the cells (h, w) whose centres are within a distance of an edge, by samples at most ``spacing`` apart."""
     h, w = cells.shape
-    count = np.maximum(np.ceil(np.abs(heads - tails) / spacing), 1).astype(np.int64)
-    edge, step = enumerate_each(count)
-    samples = tails[edge] + (heads - tails)[edge] * (step / count[edge])
     # Every point of an edge is at most half the spacing from a sample.
     reach = radius**2 + spacing**2 / 4
     k = int(sqrt(reach)) + 2
+    beyond = np.zeros(tails.size, dtype=np.bool_)
+    for one, other, side in ((tails.real, heads.real, w), (tails.imag, heads.imag, h)):
+        beyond |= (np.maximum(one, other) < -k) | (np.minimum(one, other) > side + k)
+    tails, heads = tails[~beyond], heads[~beyond]
+    count = np.maximum(np.ceil(np.abs(heads - tails) / spacing), 1).astype(np.int64)
+    edge, step = enumerate_each(count)
+    samples = tails[edge] + (heads - tails)[edge] * (step / count[edge])
     inside = (samples.imag > -k) & (samples.imag < h + k) & (samples.real > -k) & (samples.real < w + k)
     samples = samples[inside]
     i, j = np.floor(samples.imag).astype(np.int64), np.floor(samples.real).astype(np.int64)

@@ -209,7 +209,7 @@ def pack_charts(
     if occupied is not None:
         at = map_array("occupied", occupied[0])
         remedy = "move these charts, or leave them out"
-        far = np.flatnonzero(np.abs(at).max(axis=1) > _FARTHEST)
+        far = np.abs(at).max(axis=1) > _FARTHEST
         reject(far, "vertex", "vertices", f"occupied has {{}} more than {_FARTHEST:,} textures away: {remedy}")
         around = Occupied(make_shape(at * size, triangle_array(occupied[1], len(at))), size)
         layout = find_layout_around(around, shapes, into, wanted)

@@ -286,17 +286,16 @@ static PyObject *walk_stretches(PyObject *module, PyObject *const *given, Py_ssi
         return NULL;
     const Cuts cuts = {a[0].data, a[1].data, malloc((size_t)(n + 1) * sizeof(*cuts.start)),
                        malloc((size_t)(2 * edges + 1) * sizeof(*cuts.at))};
-    uint8_t *walked = calloc((size_t)edges + 1, 1), *seen = calloc((size_t)n + 1, 1);
+    uint8_t *walked = calloc((size_t)edges + 1, 1);
     int64_t *order = a[2].data, *last = a[3].data, size = 0, stretches = 0;
-    const int made = cuts.start && cuts.at && walked && seen;
+    const int made = cuts.start && cuts.at && walked;
     if (made) {
         Py_BEGIN_ALLOW_THREADS
         list_cuts(&cuts, edges, n);
         for (Py_ssize_t j = 0; j < 2 * edges; j++) {
             const int64_t node = cuts.ends[j];
-            if (seen[node] || !is_node(&cuts, node))
+            if (!is_node(&cuts, node))
                 continue;
-            seen[node] = 1;
             for (int64_t k = cuts.start[node]; k < cuts.start[node + 1]; k++)
                 if (!walked[cuts.at[k]]) {
                     size += walk(&cuts, node, cuts.at[k], walked, order + size);
@@ -308,7 +307,6 @@ static PyObject *walk_stretches(PyObject *module, PyObject *const *given, Py_ssi
     free(cuts.start);
     free(cuts.at);
     free(walked);
-    free(seen);
     return made ? done_with_integer(a, LENGTH(a), (Py_ssize_t)stretches) : out_of_memory(a, LENGTH(a));
 }
 

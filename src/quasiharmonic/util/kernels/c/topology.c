@@ -167,7 +167,7 @@ static PyObject *number_sides(PyObject *module, PyObject *const *given, Py_ssize
     return done_with_integer(a, LENGTH(a), (Py_ssize_t)edges);
 }
 
-/* Marks in `first`: no side of the edge so far; two or more sides, from which on the mark tells the first of two. */
+/* Marks in `first`: no side of the edge so far, and two or more sides, of which the first one is TWO_SIDES minus the mark. */
 enum { NO_SIDE = -1, TWO_SIDES = -2 };
 
 /* The other side of the same edge for each side, -1 where an edge has not exactly two. `first` gets the first side of each
