@@ -245,8 +245,9 @@ def test_a_callback_reports_phases_and_stops_the_search():
         find_charts(V, F, callback=stop, jobs=2)
 
 
-def test_derivatives_of_the_even_stretch():
-    assert check_energy(EvenStretch(1.3)).passed
+@pytest.mark.parametrize("linear", [True, False])
+def test_derivatives_of_the_even_stretch(linear):
+    assert check_energy(EvenStretch(1.3, linear=linear)).passed
 
 
 @pytest.mark.parametrize(("degrees", "expected"), [(25, 1), (55, 2)])

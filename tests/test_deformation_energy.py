@@ -91,7 +91,13 @@ BLEND = Combination((2.0, conformal_area_blend()), (0.5, MIPS()))
 
 @pytest.mark.parametrize(
     "energy",
-    [*ENERGIES.values(), BLEND, Hardened(BLEND, 0.3), Combination((1.0, Hardened(MIPS(), 2.0)), (1.0, ARAP()))],
+    [
+        *ENERGIES.values(),
+        BLEND,
+        Hardened(BLEND, 0.3),
+        Hardened(BLEND, 0.3, 0.5),
+        Combination((1.0, Hardened(MIPS(), 2.0)), (1.0, ARAP())),
+    ],
 )
 def test_the_package_s_energies_agree_with_their_methods(energy, rng):
     V, F, w = bowl(300)

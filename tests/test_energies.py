@@ -33,6 +33,7 @@ ISOTROPIC = [
     conformal_area_blend(0.2),
     Combination((1.0, ARAP()), (0.1, AreaBarrier())),
     Hardened(SymmetricDirichlet(), 0.5),
+    Hardened(SymmetricDirichlet(), 0.5, 0.8),
 ]
 INVERTIBLE = [ARAP(), AreaPreserving()]
 
@@ -230,3 +231,16 @@ def test_springs_reject_flat_triangles():
 
 def test_a_function_that_is_never_a_number_has_a_wrong_derivative():
     assert derivative_error(lambda x: np.nan * x.sum(), lambda x, d: d.sum(), np.ones(3)) == np.inf
+
+
+def test_a_hardened_energy_continues_by_its_tangent():
+    """The continuation is linear in E and lies below E + k E³; both agree up to the value where it begins."""
+    base, d = SymmetricDirichlet(), random_deformation(400, seed=2)
+    e, k, limit = base.density(d), 0.5, 0.8
+    hardened, continued = Hardened(base, k).density(d), Hardened(base, k, limit).density(d)
+    beyond = e > limit
+    assert 50 < np.count_nonzero(beyond) < 350
+    np.testing.assert_array_equal(continued[~beyond], hardened[~beyond])
+    assert (continued[beyond] < hardened[beyond]).all()
+    slope = 1 + 3 * k * limit**2
+    np.testing.assert_allclose(continued[beyond], limit + k * limit**3 + slope * (e[beyond] - limit), rtol=1e-12)

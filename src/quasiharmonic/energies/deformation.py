@@ -331,20 +331,20 @@ TERMS: tuple[Isotropic, ...] = MIPS(), SymmetricDirichlet(), ARAP(), AreaBarrier
 
 
 def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
-    """The factors (5,) float64 that express an energy, or None if there are none.
+    """The numbers (6,) float64 that express an energy, or None if there are none.
 
-    The first four are those of the sum of `TERMS`. The last one is the k with which it is `Hardened`. ``parts`` are the
-    methods that the caller uses. A subclass that does not override them counts as the class that has them.
+    The first four are the factors of the sum of `TERMS`. The others are ``k`` and ``linear_from`` if the sum is
+    `Hardened`, otherwise 0. ``parts`` are the methods that the caller uses. A subclass that does not override them counts as the class that has them.
     """
     if isinstance(energy, Hardened) and _keeps(type(energy), Hardened, parts):
         base = mixture_of(energy.base, *parts)
-        return None if base is None or base[-1] else np.append(base[:-1], energy.k)
+        return None if base is None or base[-2] else np.append(base[:-2], [energy.k, energy.linear_from])
     if type(energy) is not Combination:
         return _factors(type(energy), parts)
-    factors = np.zeros(len(TERMS) + 1)
+    factors = np.zeros(len(TERMS) + 2)
     for factor, term in energy.terms:
         part = mixture_of(term, *parts)
-        if part is None or part[-1]:
+        if part is None or part[-2]:
             return None
         factors += factor * part
     return factors
@@ -352,7 +352,7 @@ def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
 
 @cache
 def _factors(kind: type[Energy], parts: tuple[str, ...]) -> FloatArray | None:
-    for energy, factors in zip(TERMS, np.eye(len(TERMS), len(TERMS) + 1), strict=True):
+    for energy, factors in zip(TERMS, np.eye(len(TERMS), len(TERMS) + 2), strict=True):
         if _keeps(kind, type(energy), parts):
             return factors
     return None
@@ -364,11 +364,11 @@ def _keeps(kind: type[Energy], base: type[Energy], parts: tuple[str, ...]) -> bo
 
 
 def energy_of(mixture: FloatArray) -> Isotropic:
-    """The energy with the factors ``mixture``; the inverse of `mixture_of`."""
-    *factors, k = mixture.tolist()
+    """The energy with the numbers ``mixture``; the inverse of `mixture_of`."""
+    *factors, k, linear_from = mixture.tolist()
     terms = [(factor, energy) for factor, energy in zip(factors, TERMS, strict=True) if factor]
     base = terms[0][1] if len(terms) == 1 and terms[0][0] == 1 else Combination(*terms)
-    return Hardened(base, k) if k else base
+    return Hardened(base, k, linear_from) if k else base
 
 
 @compiled

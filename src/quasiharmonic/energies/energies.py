@@ -439,28 +439,36 @@ class Hardened(Isotropic):
         The energy E, not negative.
     k : float
         At least 0.
+    linear_from : float
+        Where E exceeds this positive value, the energy is continued by its tangent as a function of E. A few triangles
+        that cannot get better then matter less.
     """
 
-    def __init__(self, base: Isotropic, k: float) -> None:
-        self.base, self.k = base, k
+    def __init__(self, base: Isotropic, k: float, linear_from: float = np.inf) -> None:
+        self.base, self.k, self.linear_from = base, k, linear_from
         self.barrier = base.barrier
 
     def density(self, d: Deformation) -> FloatArray:
-        """``E + k E³``."""
+        """``E + k E³``, or its tangent."""
         e = self.base.density(d)
-        return e + self.k * (e * e * e)
+        least = np.minimum(e, self.linear_from)
+        hardened = e + self.k * (least * least * least)
+        beyond = e > self.linear_from
+        hardened[beyond] += 3 * self.k * self.linear_from**2 * (e[beyond] - self.linear_from)
+        return hardened
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
         """``(1 + 3k E²) dE``."""
         by_a, by_b = self.base.density_gradient(d)
-        factor = 1 + 3 * self.k * self.base.density(d) ** 2
+        factor = 1 + 3 * self.k * np.minimum(self.base.density(d), self.linear_from) ** 2
         return factor * by_a, factor * by_b
 
     def density_hessian(self, d: Deformation) -> tuple[FloatArray, FloatArray, FloatArray]:
         """``(1 + 3k E²) d²E + 6k E dE²``."""
         e, (by_a, by_b) = self.base.density(d), self.base.density_gradient(d)
         aa, ab, bb = self.base.density_hessian(d)
-        factor, square = 1 + 3 * self.k * e**2, 6 * self.k * e
+        factor = 1 + 3 * self.k * np.minimum(e, self.linear_from) ** 2
+        square = np.where(e > self.linear_from, 0.0, 6 * self.k * e)
         return factor * aa + square * by_a**2, factor * ab + square * by_a * by_b, factor * bb + square * by_b**2
 
 

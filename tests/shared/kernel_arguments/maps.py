@@ -104,8 +104,9 @@ def strained(rng) -> Arguments:
 
 MIXTURES = np.concatenate(
     [
-        np.eye(4, 5),
-        [[127 / 128, 0, 0, 1 / 128, 0], [0, 0, 1, 0.1, 0], [0.5, 2, 0.25, 3, 0], [0, 1, 0, 0, 4], [1, 0, 2, 0.5, 0.3]],
+        np.eye(4, 6),
+        [[127 / 128, 0, 0, 1 / 128, 0, 0], [0, 0, 1, 0.1, 0, 0], [0.5, 2, 0.25, 3, 0, 0], [0, 1, 0, 0, 4, np.inf]],
+        [[1, 0, 2, 0.5, 0.3, np.inf], [0, 1, 0, 0, 4, 0.2], [1, 0, 2, 0.5, 0.3, 2]],
     ]
 )
 
@@ -115,13 +116,13 @@ def _(rng):
     """Sometimes with a triangle of infinite energy."""
     p, q, det = strained(rng)
     keep = np.isfinite(p) & (det > -rng.integers(2))
-    return MIXTURES[rng.integers(9)], p[keep], q[keep], det[keep], rng.uniform(size=int(keep.sum()))
+    return MIXTURES[rng.integers(len(MIXTURES))], p[keep], q[keep], det[keep], rng.uniform(size=int(keep.sum()))
 
 
 @arguments_of("mixed_slopes")
 def _(rng):
     p, q, det = strained(rng)
-    return MIXTURES[rng.integers(9)], p, q, det, numbers(rng, p.size), numbers(rng, p.size)
+    return MIXTURES[rng.integers(len(MIXTURES))], p, q, det, numbers(rng, p.size), numbers(rng, p.size)
 
 
 @arguments_of("mixed_curvature")
@@ -129,7 +130,7 @@ def _(rng):
     p, q, det = strained(rng)
     share, negative = rng.uniform(size=p.size), float(rng.integers(-1, 2))
     fields = rng.normal(size=(2, p.size)), numbers(rng, 4, p.size)
-    return MIXTURES[rng.integers(9)], p, q, det, share, negative, *fields[0], *fields[1]
+    return MIXTURES[rng.integers(len(MIXTURES))], p, q, det, share, negative, *fields[0], *fields[1]
 
 
 @arguments_of("rigid_proxies")

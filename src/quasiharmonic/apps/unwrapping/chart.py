@@ -11,10 +11,10 @@ import numpy as np
 
 from quasiharmonic.apps.atlas.packing.pack import find_copies
 from quasiharmonic.apps.atlas.packing.shapes import Shape, make_shape
-from quasiharmonic.apps.unwrapping.chart_maps import NO_CUT, WorkingChart
+from quasiharmonic.apps.unwrapping.chart_maps import WorkingChart
 from quasiharmonic.apps.unwrapping.symmetry import Mirror
 from quasiharmonic.geometry.mesh.reference import area_vectors
-from quasiharmonic.geometry.mesh.splitting import renumber, split_parts
+from quasiharmonic.geometry.mesh.splitting import NO_CUT, renumber, split_parts
 from quasiharmonic.geometry.mesh.topology import components, group_by_label
 from quasiharmonic.util.arrays import BoolArray, FloatArray, IntArray, scale_to_unit
 from quasiharmonic.util.progress import heartbeat

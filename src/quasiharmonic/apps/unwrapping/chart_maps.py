@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from quasiharmonic.apps.flattening.flattening_run import Flattening
-from quasiharmonic.apps.flattening.multilevel import flatten_coarse, map_to_disk
-from quasiharmonic.apps.flattening.piece import COARSE_FROM, Piece
+from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.apps.flattening.surface_descent import SurfaceDescent, descend
 from quasiharmonic.apps.flattening.worst_triangles import descend_on_patches
+from quasiharmonic.apps.unwrapping.chart_starts import find_initial_map
 from quasiharmonic.energies.deformation import DeformationEnergy
 from quasiharmonic.energies.energies import Energy, Hardened, SymmetricDirichlet
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
@@ -38,8 +38,6 @@ WORST_STRETCH = 3.0
 THIN_ANGLE = np.pi / 180
 #: Share of the area that may be stretched beyond the bound.
 FREE_SHARE = 0.01
-#: No edges (0, 2), for `split_parts`.
-NO_CUT = np.empty((0, 2), dtype=np.int64)
 
 
 class ChartTuning(NamedTuple):
@@ -58,7 +56,7 @@ class ChartTuning(NamedTuple):
     # Number of quasi-Newton steps that count as one step.
     window: int = 5
     # From mean energies below this, quasi-Newton steps are used.
-    near: float = 1.0
+    near: float = 3.0
     # Charts with at most this number of vertices get the linear solver for small systems. It takes half the time there,
     # though more than others for compact meshes of this size.
     narrow: int = 5_000
@@ -76,10 +74,14 @@ class EvenStretch(Hardened):
     ----------
     bound : float
         Above 1. Where one singular value has this stretch and the other is 1, the second term is three times the first.
+    linear : bool
+        Whether the energy is linear in E beyond there. Then a few triangles that stay stretched, such as thin ones, do
+        not outweigh the rest of the chart. Otherwise its descent ends before the rest is at its minimum.
     """
 
-    def __init__(self, bound: float) -> None:
-        super().__init__(SymmetricDirichlet(), 3 / max((bound - 1 / bound) ** 2, _TUNING.least_energy) ** 2)
+    def __init__(self, bound: float, *, linear: bool = True) -> None:
+        energy = max((bound - 1 / bound) ** 2, _TUNING.least_energy)
+        super().__init__(SymmetricDirichlet(), 3 / energy**2, energy if linear else np.inf)
 
 
 @dataclass(eq=False)
@@ -199,7 +201,9 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
     """
     if chart.uv is None:
         flat = chart.piece.planar_map()
-        uv = flat if flat is not None else chart.start if chart.start is not None else _initial_map(chart.piece)
+        uv = flat if flat is not None else chart.start
+        if uv is None:
+            uv = find_initial_map(chart.piece, chart.linear_solver)
         if uv is None:
             chart.stretch = np.full(len(chart.F), np.inf)
             return
@@ -216,6 +220,8 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
         if keeps_bound(chart, bound) and chart.bijective:
             return
     _descend(chart, EvenStretch(bound), check_wanted)
+    if chart.too_long.any():
+        _relax(chart, bound, chart.too_long)
 
 
 def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None:
@@ -230,16 +236,6 @@ def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None
 def keeps_bound(chart: WorkingChart, bound: float) -> bool:
     """Whether a chart on its own keeps the bound."""
     return chart.share_over(bound) <= FREE_SHARE and not chart.too_long.any()
-
-
-def _initial_map(piece: Piece) -> FloatArray | None:
-    """An injective map (n, 2), or None if none was found in double precision."""
-    starts = [map_to_disk, flatten_coarse]
-    for start in reversed(starts) if len(piece.F) >= COARSE_FROM else starts:
-        uv = start(piece.V, piece.F, piece.loops)
-        if uv is not None:
-            return uv
-    return None
 
 
 @np.errstate(all="ignore")
@@ -314,7 +310,7 @@ def relax_thin(chart: WorkingChart, bound: float) -> None:
 def _relax(chart: WorkingChart, bound: float, long: BoolArray) -> None:
     """Lower the stretch around some triangles (k,), with the rest of the map fixed."""
     assert chart.uv is not None
-    density = EvenStretch(bound)
+    density = EvenStretch(bound, linear=False)
     moved = descend_on_patches(chart.piece.energy(density, None), density, chart.uv, long, chart.linear_solver)
     if moved is not None:
         chart.use(moved)

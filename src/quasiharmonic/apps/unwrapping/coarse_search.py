@@ -25,25 +25,24 @@ import numpy as np
 
 from quasiharmonic.apps.flattening.worst_triangles import mark_around
 from quasiharmonic.apps.unwrapping.chart import Chart, finish_chart
-from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, NO_CUT, WorkingChart
+from quasiharmonic.apps.unwrapping.chart_maps import FREE_SHARE, WorkingChart
 from quasiharmonic.apps.unwrapping.chart_search import AIM_OF_CARRIED, Workers, search_charts
+from quasiharmonic.apps.unwrapping.chart_starts import repair_map
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.geometry.coarsening import Removal, has_marked_corner, mark_rings
-from quasiharmonic.geometry.exact.certificate import is_injective
+from quasiharmonic.geometry.coarsening import Removal, has_marked_corner
 from quasiharmonic.geometry.exact.loops import check_loops
-from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.reference import surface_area
-from quasiharmonic.geometry.mesh.splitting import split_parts
+from quasiharmonic.geometry.mesh.splitting import NO_CUT, split_parts
 from quasiharmonic.geometry.mesh.topology import boundary_edges, find_pairs
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import Laplacian, weigh_edges
 from quasiharmonic.targets.cuts.find import find_cuts_by
 from quasiharmonic.targets.cuts.graph import EdgeGraph, edge_graph
-from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, sum_at, to_complex, to_points
+from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, sum_at, to_complex, to_points
 
 
 class FitTuning(NamedTuple):
-    """Numbers that tune the fits of maps to rotated triangles, and their repair."""
+    """Numbers that tune the fits of maps to rotated triangles."""
 
     # Number of further fits to rotated triangles, after the first one. Later fits permit some stretch.
     rotated_fits: int = 3
@@ -57,10 +56,6 @@ class FitTuning(NamedTuple):
     permitted: float = 0.5
     # A triangle whose singular values have a smaller ratio gets a new rotation.
     least_ratio: float = 0.15
-    # Maps with a larger share of inverted triangles are not repaired.
-    few: float = 0.05
-    # Rings of triangles around inverted ones that are mapped again, first and later.
-    rings: tuple[int, int] = 2, 6
     # Maps with more crossings of their boundary than this share of its edges are not used.
     few_crossings: float = 0.01
     # A coarse mesh with a larger share of the vertices is cut without a coarser one.
@@ -220,7 +215,7 @@ def _fit(
     rim = sum(map(len, chart.piece.loops))
     if len(check_loops(chart.piece.loops, to_points(w))[0]) > _TUNING.few_crossings * rim:
         return None
-    return _repair(chart, to_points(w))
+    return repair_map(chart.piece, to_points(w))
 
 
 def _derivatives(g: ComplexArray, at: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
@@ -231,36 +226,6 @@ def _derivatives(g: ComplexArray, at: ComplexArray) -> tuple[ComplexArray, Compl
 def _direction(p: ComplexArray) -> ComplexArray:
     """Return ``p / |p|``, or 0."""
     return p / np.maximum(np.abs(p), np.finfo(np.float64).tiny)
-
-
-def _repair(chart: WorkingChart, uv: FloatArray) -> FloatArray | None:
-    """Map the surroundings of inverted triangles again, with all other vertices fixed; None if that fails.
-
-    If the surroundings have no map, larger ones are mapped.
-    """
-    n = len(uv)
-    rim = mark(n, *chart.piece.loops)
-    for rings in _TUNING.rings:
-        if is_injective(chart.F, uv):
-            return uv
-        inverted = triangle_signs(chart.F, uv)[0] <= 0
-        if np.count_nonzero(inverted) > _TUNING.few * len(chart.F):
-            return None
-        loose = mark_rings(chart.F, mark(n, chart.F[inverted]), rings) & ~rim
-        rows = np.flatnonzero(has_marked_corner(chart.F, loose))
-        if not rows.size:
-            return None
-        # Few surfaces need this, and it imports the whole solver.
-        from quasiharmonic.solver.mapping import injective_map
-
-        for _, T, vertices in split_parts(chart.F[rows], rows, NO_CUT, n):
-            fixed = np.flatnonzero(~loose[vertices])
-            try:
-                uv[vertices] = injective_map(chart.V[vertices], T, fixed, uv[vertices[fixed]]).uv
-            except ValueError:
-                # The surroundings are no disks.
-                return None
-    return uv if is_injective(chart.F, uv) else None
 
 
 class _Unfolding:

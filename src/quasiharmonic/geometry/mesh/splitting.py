@@ -49,6 +49,9 @@ _GAPS = 4
 #: Weights of old vertices in a new vertex.
 Shares = dict[int, float]
 
+#: No edges (0, 2), for `split_parts`.
+NO_CUT = np.empty((0, 2), dtype=np.int64)
+
 
 def fans(
     F: IntArray, cut: BoolArray | None = None, pairs: tuple[IntArray, IntArray] | None = None

@@ -1,5 +1,5 @@
 /* Kernels of `energies/deformation.py`: sums of the library's isotropic energies, in a = |p|^2 and b = |q|^2. A sum E
-   can be hardened to E + k E^3. */
+   can be hardened to E + k E^3, continued by its tangent where E is large. */
 #include "arguments.h"
 
 #include <math.h>
@@ -8,8 +8,8 @@
 /* Triangles at a time: what is in between stays in the core's first cache, and is made by loops without jumps. */
 enum { CHUNK = 128 };
 
-/* The order of `TERMS`, and the factor k. */
-enum { MIPS, SYMMETRIC_DIRICHLET, ARAP, AREA_BARRIER, CUBE, FACTORS };
+/* The order of `TERMS`, the factor k, and the E from which the tangent is used. */
+enum { MIPS, SYMMETRIC_DIRICHLET, ARAP, AREA_BARRIER, CUBE, LINEAR_FROM, NUMBERS };
 
 typedef struct {
     Py_ssize_t size;
@@ -77,12 +77,15 @@ static void add_densities(const double *mixture, const Squares *d, double *densi
 
 static void take_densities(const double *mixture, const Squares *d, double *density)
 {
-    const double k = mixture[CUBE];
+    const double k = mixture[CUBE], linear_from = mixture[LINEAR_FROM];
     memset(density, 0, CHUNK * sizeof *density);
     add_densities(mixture, d, density);
     if (k != 0)
-        for (Py_ssize_t j = 0; j < d->size; j++)
-            density[j] += k * (density[j] * density[j] * density[j]);
+        for (Py_ssize_t j = 0; j < d->size; j++) {
+            const double e = density[j], least = e > linear_from ? linear_from : e;
+            const double tangent = 3 * k * (least * least) * (e - linear_from);
+            density[j] = e + k * (least * least * least) + (e > linear_from ? tangent : 0);
+        }
 }
 
 static void add_slopes(const double *mixture, const Squares *d, Slopes *slopes)
@@ -162,7 +165,7 @@ static void add_bends(const double *mixture, const Squares *d, Bends *bends)
 /* The first derivatives, and the second ones unless `bends` is NULL. */
 static void take_derivatives(const double *mixture, const Squares *d, Slopes *slopes, Bends *bends)
 {
-    const double k = mixture[CUBE];
+    const double k = mixture[CUBE], linear_from = mixture[LINEAR_FROM];
     memset(slopes, 0, sizeof *slopes);
     add_slopes(mixture, d, slopes);
     if (bends) {
@@ -174,7 +177,8 @@ static void take_derivatives(const double *mixture, const Squares *d, Slopes *sl
     double density[CHUNK] = {0};
     add_densities(mixture, d, density);
     for (Py_ssize_t j = 0; j < d->size; j++) {
-        const double e = density[j], factor = 1 + 3 * k * (e * e), square = 6 * k * e;
+        const double e = density[j], least = e > linear_from ? linear_from : e;
+        const double factor = 1 + 3 * k * (least * least), square = e > linear_from ? 0 : 6 * k * e;
         const double by_a = slopes->a[j], by_b = slopes->b[j];
         slopes->a[j] *= factor;
         slopes->b[j] *= factor;
@@ -196,7 +200,7 @@ static PyObject *mixed_energy(PyObject *module, PyObject *const *given, Py_ssize
     const double *mixture = arguments[0].data, *share = arguments[4].data;
     const Py_ssize_t f = arguments[3].size;
     if (!fit("mixed_energy", arguments, LENGTH(arguments),
-             arguments[0].size == FACTORS && arguments[1].size == f && arguments[2].size == f &&
+             arguments[0].size == NUMBERS && arguments[1].size == f && arguments[2].size == f &&
              arguments[4].size == f))
         return NULL;
     double total = 0, lost = 0, plain = 0;
@@ -233,7 +237,7 @@ static PyObject *mixed_slopes(PyObject *module, PyObject *const *given, Py_ssize
     double *by_p = arguments[4].data, *by_q = arguments[5].data;
     const Py_ssize_t f = arguments[3].size;
     if (!fit("mixed_slopes", arguments, LENGTH(arguments),
-             arguments[0].size == FACTORS && arguments[1].size == f && arguments[2].size == f &&
+             arguments[0].size == NUMBERS && arguments[1].size == f && arguments[2].size == f &&
              arguments[4].size == f && arguments[5].size == f))
         return NULL;
     Squares d;
@@ -308,7 +312,7 @@ static PyObject *mixed_curvature(PyObject *module, PyObject *const *given, Py_ss
     double *pq = arguments[10].data, *pqc = arguments[11].data;
     const Py_ssize_t f = arguments[3].size;
     if (!fit("mixed_curvature", arguments, LENGTH(arguments),
-             arguments[0].size == FACTORS && arguments[1].size == f && arguments[2].size == f &&
+             arguments[0].size == NUMBERS && arguments[1].size == f && arguments[2].size == f &&
              arguments[4].size == f && arguments[6].size == f && arguments[7].size == f &&
              arguments[8].size == f && arguments[9].size == f && arguments[10].size == f &&
              arguments[11].size == f))
