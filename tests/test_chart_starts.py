@@ -110,7 +110,10 @@ def test_other_surfaces_are_mapped_to_a_disk(monkeypatch, reason):
     np.testing.assert_array_equal(find_initial_map(piece, "auto"), map_to_disk(piece.V, piece.F, piece.loops))
 
 
-def test_the_surroundings_of_inverted_triangles_are_mapped_again():
+@pytest.mark.parametrize("embedded", [True, False])
+def test_the_surroundings_of_inverted_triangles_are_mapped_again(monkeypatch, embedded):
+    if not embedded:
+        monkeypatch.setattr(chart_starts, "embed_tutte", lambda F, w, fixed: w)
     V, F = irregular_disk(400, 6)
     piece = Piece(V, F)
     uv = piece.V[:, :2].copy()

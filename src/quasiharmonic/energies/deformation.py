@@ -334,7 +334,8 @@ def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
     """The numbers (6,) float64 that express an energy, or None if there are none.
 
     The first four are the factors of the sum of `TERMS`. The others are ``k`` and ``linear_from`` if the sum is
-    `Hardened`, otherwise 0. ``parts`` are the methods that the caller uses. A subclass that does not override them counts as the class that has them.
+    `Hardened`, otherwise 0. ``parts`` are the methods that the caller uses. A subclass that does not override them
+    counts as the class that has them.
     """
     if isinstance(energy, Hardened) and _keeps(type(energy), Hardened, parts):
         base = mixture_of(energy.base, *parts)

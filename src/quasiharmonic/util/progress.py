@@ -106,7 +106,8 @@ class TimeLimit:
 
     def check(self, ahead: float = 0.0) -> None:
         """Raise KeyboardInterrupt, once in each thread, if this limit or an outer one is over so many seconds ahead."""
-        if not hasattr(self._raised, "once") and time.monotonic() + ahead >= self._end:
+        limited = self._end < np.inf and not hasattr(self._raised, "once")
+        if limited and time.monotonic() + ahead >= self._end:
             self.reached = self._raised.once = True
             raise KeyboardInterrupt
         if self._outer is not None:

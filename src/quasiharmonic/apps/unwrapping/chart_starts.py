@@ -12,7 +12,8 @@ from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.splitting import NO_CUT, split_parts
 from quasiharmonic.linsolve import NotPositiveDefinite
-from quasiharmonic.util.arrays import FloatArray, mark
+from quasiharmonic.linsolve.laplacian import embed_tutte
+from quasiharmonic.util.arrays import FloatArray, IntArray, mark, to_complex, to_points
 
 # Maps with a larger share of inverted triangles are not repaired.
 _FEW = 0.05
@@ -55,14 +56,23 @@ def repair_map(piece: Piece, uv: FloatArray) -> FloatArray | None:
         rows = np.flatnonzero(has_marked_corner(F, loose))
         if not rows.size:
             return None
+        for _, T, vertices in split_parts(F[rows], rows, NO_CUT, n):
+            found = _map_surroundings(piece.V[vertices], T, uv[vertices], np.flatnonzero(~loose[vertices]))
+            if found is None:
+                return None
+            uv[vertices] = found
+    return uv if is_injective(F, uv) else None
+
+
+def _map_surroundings(V: FloatArray, F: IntArray, uv: FloatArray, fixed: IntArray) -> FloatArray | None:
+    """Map a part (m, 2) of a surface, with some vertices (k,) fixed; None if it is no disk."""
+    try:
+        embedded = to_points(embed_tutte(F, to_complex(uv), fixed))
+        if is_injective(F, embedded):
+            return embedded
         # Few surfaces need this, and it imports the whole solver.
         from quasiharmonic.solver.mapping import injective_map
 
-        for _, T, vertices in split_parts(F[rows], rows, NO_CUT, n):
-            fixed = np.flatnonzero(~loose[vertices])
-            try:
-                uv[vertices] = injective_map(piece.V[vertices], T, fixed, uv[vertices[fixed]]).uv
-            except ValueError:
-                # The surroundings are no disks.
-                return None
-    return uv if is_injective(F, uv) else None
+        return injective_map(V, F, fixed, uv[fixed]).uv
+    except (NotPositiveDefinite, ValueError):
+        return None
