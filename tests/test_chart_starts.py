@@ -16,6 +16,7 @@ from quasiharmonic.geometry.exact.certificate import is_injective
 from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.surfaces import disk
 from quasiharmonic.linsolve import NotPositiveDefinite
+from quasiharmonic.util.progress import time_limit
 from shared.meshes import irregular_disk, lift, random_annulus
 
 
@@ -110,10 +111,8 @@ def test_other_surfaces_are_mapped_to_a_disk(monkeypatch, reason):
     np.testing.assert_array_equal(find_initial_map(piece, "auto"), map_to_disk(piece.V, piece.F, piece.loops))
 
 
-@pytest.mark.parametrize("embedded", [True, False])
-def test_the_surroundings_of_inverted_triangles_are_mapped_again(monkeypatch, embedded):
-    if not embedded:
-        monkeypatch.setattr(chart_starts, "embed_tutte", lambda F, w, fixed: w)
+def folded():
+    """A piece and a map of it in which few triangles are inverted around one vertex, with its index."""
     V, F = irregular_disk(400, 6)
     piece = Piece(V, F)
     uv = piece.V[:, :2].copy()
@@ -122,12 +121,28 @@ def test_the_surroundings_of_inverted_triangles_are_mapped_again(monkeypatch, em
     ring = np.unique(F[(moved == F).any(axis=1)])
     uv[moved] += 1.5 * (uv[ring[ring != moved][0]] - uv[moved])
     assert 0 < np.count_nonzero(triangle_signs(F, uv)[0] <= 0) < 10
+    return piece, uv, moved
+
+
+@pytest.mark.parametrize("embedded", [True, False])
+def test_the_surroundings_of_inverted_triangles_are_mapped_again(monkeypatch, embedded):
+    if not embedded:
+        monkeypatch.setattr(chart_starts, "embed_tutte", lambda F, w, fixed: w)
+    piece, uv, moved = folded()
     before = uv.copy()
     repaired = repair_map(piece, uv)
-    assert is_injective(F, repaired)
+    assert is_injective(piece.F, repaired)
     changed = (repaired != before).any(axis=1)
     assert changed[moved]
     assert 0 < np.count_nonzero(changed) < 60
+
+
+def test_a_time_limit_ends_the_repair(monkeypatch):
+    monkeypatch.setattr(chart_starts, "embed_tutte", lambda F, w, fixed: w)
+    piece, uv, _ = folded()
+    with time_limit(0) as limit, pytest.raises(KeyboardInterrupt):
+        repair_map(piece, uv)
+    assert limit.reached
 
 
 @pytest.mark.parametrize("F", [[[0, 1, 2], [0, 2, 3]], [[0, 2, 1], [0, 3, 2]]])

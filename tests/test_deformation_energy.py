@@ -96,6 +96,7 @@ BLEND = Combination((2.0, conformal_area_blend()), (0.5, MIPS()))
         BLEND,
         Hardened(BLEND, 0.3),
         Hardened(BLEND, 0.3, 0.5),
+        Combination((0.0, Hardened(MIPS(), 0)), (1.0, ARAP())),
         Combination((1.0, Hardened(MIPS(), 2.0)), (1.0, ARAP())),
     ],
 )

@@ -244,3 +244,11 @@ def test_a_hardened_energy_continues_by_its_tangent():
     assert (continued[beyond] < hardened[beyond]).all()
     slope = 1 + 3 * k * limit**2
     np.testing.assert_allclose(continued[beyond], limit + k * limit**3 + slope * (e[beyond] - limit), rtol=1e-12)
+
+
+def test_second_derivatives_of_a_linear_continuation_are_finite_near_collapse():
+    """The square of the slope overflows there, but has no share in them."""
+    det = 10.0 ** -np.arange(40, 75, 5)
+    d = Deformation(np.ones(det.size, dtype=complex), 1 - det + 0j, det)
+    for part in Hardened(SymmetricDirichlet(), 2, 1.0).density_hessian(d):
+        assert np.isfinite(part).all()

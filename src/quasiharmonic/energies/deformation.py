@@ -339,7 +339,8 @@ def mixture_of(energy: Energy, *parts: str) -> FloatArray | None:
     """
     if isinstance(energy, Hardened) and _keeps(type(energy), Hardened, parts):
         base = mixture_of(energy.base, *parts)
-        return None if base is None or base[-2] else np.append(base[:-2], [energy.k, energy.linear_from])
+        hardness = [energy.k, energy.linear_from] if energy.k else [0.0, 0.0]
+        return None if base is None or base[-2] else np.append(base[:-2], hardness)
     if type(energy) is not Combination:
         return _factors(type(energy), parts)
     factors = np.zeros(len(TERMS) + 2)

@@ -453,8 +453,8 @@ class Hardened(Isotropic):
         e = self.base.density(d)
         least = np.minimum(e, self.linear_from)
         hardened = e + self.k * (least * least * least)
-        beyond = e > self.linear_from
-        hardened[beyond] += 3 * self.k * self.linear_from**2 * (e[beyond] - self.linear_from)
+        if self.linear_from < np.inf:
+            hardened = hardened + 3 * self.k * self.linear_from**2 * np.maximum(e - self.linear_from, 0)
         return hardened
 
     def density_gradient(self, d: Deformation) -> tuple[FloatArray, FloatArray]:
@@ -468,7 +468,9 @@ class Hardened(Isotropic):
         e, (by_a, by_b) = self.base.density(d), self.base.density_gradient(d)
         aa, ab, bb = self.base.density_hessian(d)
         factor = 1 + 3 * self.k * np.minimum(e, self.linear_from) ** 2
-        square = np.where(e > self.linear_from, 0.0, 6 * self.k * e)
+        # Squares of large slopes overflow, so the slopes are dropped where the energy is linear in E.
+        linear = e > self.linear_from
+        by_a, by_b, square = (np.where(linear, 0.0, part) for part in (by_a, by_b, 6 * self.k * e))
         return factor * aa + square * by_a**2, factor * ab + square * by_a * by_b, factor * bb + square * by_b**2
 
 

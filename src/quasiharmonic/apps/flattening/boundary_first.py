@@ -52,6 +52,7 @@ def map_boundary_first(piece: Piece, linear_solver: str = "auto") -> FloatArray 
     angles = corner_angles(energy.g[(2, 0, 1), :])
     sums = np.bincount(F.ravel(), angles.ravel(), n)
     laplacian = Laplacian(F, n, loop, linear_solver).factor(weigh_edges(energy.g, energy.share))
+    # The Laplacian has a constant factor, which w is divided by. The flux and the harmonic map do not depend on it.
     w = laplacian.respond((sums - 2 * np.pi).astype(np.complex128))
     turning = np.pi - sums[loop] + laplacian.flux(w)[loop].real
     side = np.linalg.norm(piece.V[np.roll(loop, -1)] - piece.V[loop], axis=1)

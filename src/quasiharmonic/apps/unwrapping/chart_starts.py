@@ -13,6 +13,7 @@ from quasiharmonic.geometry.exact.triangles import triangle_signs
 from quasiharmonic.geometry.mesh.splitting import NO_CUT, split_parts
 from quasiharmonic.linsolve import NotPositiveDefinite
 from quasiharmonic.linsolve.laplacian import embed_tutte
+from quasiharmonic.problem.result import Status
 from quasiharmonic.util.arrays import FloatArray, IntArray, mark, to_complex, to_points
 
 # Maps with a larger share of inverted triangles are not repaired.
@@ -24,7 +25,7 @@ _RINGS = 2, 6
 def find_initial_map(piece: Piece, linear_solver: str) -> FloatArray | None:
     """Return a map (n, 2) without inverted triangles, or None if none was found in double precision.
 
-    Its boundary may meet itself. A nearly conformal map needs about a third of the steps that a map to a disk needs.
+    Its boundary may meet itself. A nearly conformal map has less energy than a map to a disk, often by far.
     """
     try:
         uv = map_boundary_first(piece, linear_solver)
@@ -73,6 +74,9 @@ def _map_surroundings(V: FloatArray, F: IntArray, uv: FloatArray, fixed: IntArra
         # Few surfaces need this, and it imports the whole solver.
         from quasiharmonic.solver.mapping import injective_map
 
-        return injective_map(V, F, fixed, uv[fixed]).uv
+        result = injective_map(V, F, fixed, uv[fixed])
     except (NotPositiveDefinite, ValueError):
         return None
+    if result.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    return result.uv

@@ -179,7 +179,8 @@ static void take_derivatives(const double *mixture, const Squares *d, Slopes *sl
     for (Py_ssize_t j = 0; j < d->size; j++) {
         const double e = density[j], least = e > linear_from ? linear_from : e;
         const double factor = 1 + 3 * k * (least * least), square = e > linear_from ? 0 : 6 * k * e;
-        const double by_a = slopes->a[j], by_b = slopes->b[j];
+        /* Squares of large slopes overflow: not where they do not matter. */
+        const double by_a = e > linear_from ? 0 : slopes->a[j], by_b = e > linear_from ? 0 : slopes->b[j];
         slopes->a[j] *= factor;
         slopes->b[j] *= factor;
         if (bends) {
