@@ -18,7 +18,7 @@ import numpy as np
 
 from quasiharmonic.apps.flattening.piece import Piece
 from quasiharmonic.energies.energies import SymmetricDirichlet
-from quasiharmonic.geometry.mesh.reference import corner_angles
+from quasiharmonic.geometry.mesh.reference import corner_angles, loop_lengths
 from quasiharmonic.linsolve.laplacian import Laplacian, weigh_edges
 from quasiharmonic.util.arrays import ComplexArray, FloatArray, to_points
 
@@ -55,9 +55,8 @@ def map_boundary_first(piece: Piece, linear_solver: str = "auto") -> FloatArray 
     # The Laplacian has a constant factor, which w is divided by. The flux and the harmonic map do not depend on it.
     w = laplacian.respond((sums - 2 * np.pi).astype(np.complex128))
     turning = np.pi - sums[loop] + laplacian.flux(w)[loop].real
-    side = np.linalg.norm(piece.V[np.roll(loop, -1)] - piece.V[loop], axis=1)
     image = np.zeros(n, dtype=np.complex128)
-    image[loop] = close_polygon(side, turning)
+    image[loop] = close_polygon(loop_lengths(piece.V, loop), turning)
     image = laplacian.extend(image)
     return to_points(image) if np.isfinite(image).all() else None
 

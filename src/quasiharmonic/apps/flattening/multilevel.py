@@ -29,7 +29,7 @@ from quasiharmonic.energies.energies import SymmetricDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.coarsening import coarsen
 from quasiharmonic.geometry.exact.certificate import is_injective
-from quasiharmonic.geometry.mesh.reference import surface_area
+from quasiharmonic.geometry.mesh.reference import loop_lengths, surface_area
 from quasiharmonic.geometry.mesh.splitting import make_fans
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.geometry.prolongation import reinsertion_positions
@@ -366,7 +366,7 @@ def map_to_disk(
     # The search's modules take longer to import than `unwrap` takes for a model of flat parts, which needs none.
     from quasiharmonic.solver.mapping import solve
 
-    lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
+    lengths = [loop_lengths(V, loop) for loop in loops]
     longest = int(np.argmax([length.sum() for length in lengths]))
     outer = loops[longest]
     holes = [loop for k, loop in enumerate(loops) if k != longest]

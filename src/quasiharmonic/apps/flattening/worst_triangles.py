@@ -30,7 +30,7 @@ from quasiharmonic.energies.measures import distortion
 from quasiharmonic.energies.newton.distant_starts import ReweightedDirichlet
 from quasiharmonic.energies.newton.map_model import in_units
 from quasiharmonic.geometry.coarsening import has_marked_corner, mark_rings
-from quasiharmonic.geometry.mesh.reference import rest_frames, rest_shapes
+from quasiharmonic.geometry.mesh.reference import loop_lengths, rest_frames, rest_shapes
 from quasiharmonic.geometry.prolongation import are_positive
 from quasiharmonic.util.arrays import BoolArray, ComplexArray, FloatArray, IntArray, mark, to_points
 
@@ -249,7 +249,7 @@ def _sides(first: FloatArray | ComplexArray, second: ComplexArray) -> FloatArray
 
 def stretch_of_boundary(V: FloatArray, loops: Sequence[IntArray], area: float) -> float:
     """The factor, at least 1, by which the boundary must lengthen to enclose the surface's area in the plane."""
-    length = sum(float(np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1).sum()) for loop in loops)
+    length = sum(float(loop_lengths(V, loop).sum()) for loop in loops)
     return max(float(np.sqrt(4 * np.pi * area)) / length, 1.0) if length > 0 else np.inf
 
 

@@ -220,8 +220,7 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
         if keeps_bound(chart, bound) and chart.bijective:
             return
     _descend(chart, EvenStretch(bound), check_wanted)
-    if chart.too_long.any():
-        _relax(chart, bound, chart.too_long)
+    _relax(chart, bound, chart.too_long)
 
 
 def guard_chart(chart: WorkingChart, check_wanted: Callable[[], object]) -> None:
@@ -292,7 +291,7 @@ def _relax_long(chart: WorkingChart, bound: float) -> None:
 
     Without effect where too much of the chart exceeds the bound, so that all of the map must change.
     """
-    if chart.too_long.any() and chart.share_over(bound) <= FREE_SHARE:
+    if chart.share_over(bound) <= FREE_SHARE:
         _relax(chart, bound, chart.too_long)
 
 
@@ -308,8 +307,10 @@ def relax_thin(chart: WorkingChart, bound: float) -> None:
 
 
 def _relax(chart: WorkingChart, bound: float, long: BoolArray) -> None:
-    """Lower the stretch around some triangles (k,), with the rest of the map fixed."""
+    """Lower the stretch around some triangles (k,), if there are any, with the rest of the map fixed."""
     assert chart.uv is not None
+    if not long.any():
+        return
     density = EvenStretch(bound, linear=False)
     moved = descend_on_patches(chart.piece.energy(density, None), density, chart.uv, long, chart.linear_solver)
     if moved is not None:

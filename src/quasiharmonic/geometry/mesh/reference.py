@@ -306,6 +306,11 @@ def surface_area(V: FloatArray, F: NDArray[np.integer]) -> float:
     return 0.5 * float(np.linalg.norm(area_vectors(V, F), axis=1).sum())
 
 
+def loop_lengths(V: FloatArray, loop: IntArray) -> FloatArray:
+    """Return the lengths (l,) of the edges of a loop of vertices, from each one to the next."""
+    return np.asarray(np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1))
+
+
 def corner_angles(sides: ComplexArray) -> FloatArray:
     """Return the angles (f, 3) in radians of triangles that are given by their sides (3, f), as in `RestShapes`."""
     return np.stack([np.abs(np.angle(-sides[k - 1].conj() * sides[k])) for k in range(3)], axis=1)

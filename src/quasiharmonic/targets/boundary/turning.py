@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quasiharmonic.geometry.mesh.reference import rest_frames
+from quasiharmonic.geometry.mesh.reference import loop_lengths, rest_frames
 from quasiharmonic.geometry.mesh.topology import boundary_loops
 from quasiharmonic.io.accepts_mesh import accepts_mesh
 from quasiharmonic.util.arrays import (
@@ -131,7 +131,7 @@ def boundary_turning(V: ArrayLike, F: ArrayLike) -> list[BoundaryLoop]:
     loops = boundary_loops(F, len(V))
     on_boundary = mark(len(V), *loops)
     angle = _angle_sums(V, F[on_boundary[F].any(axis=1)])
-    lengths = [np.linalg.norm(V[np.roll(loop, -1)] - V[loop], axis=1) for loop in loops]
+    lengths = [loop_lengths(V, loop) for loop in loops]
     return [
         BoundaryLoop(loop, np.ldexp(length, exponent), np.pi - angle[loop])
         for loop, length in zip(loops, lengths, strict=True)

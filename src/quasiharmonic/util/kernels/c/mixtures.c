@@ -179,7 +179,7 @@ static void take_derivatives(const double *mixture, const Squares *d, Slopes *sl
     for (Py_ssize_t j = 0; j < d->size; j++) {
         const double e = density[j], least = e > linear_from ? linear_from : e;
         const double factor = 1 + 3 * k * (least * least), square = e > linear_from ? 0 : 6 * k * e;
-        /* Squares of large slopes overflow: not where they do not matter. */
+        /* Squares of large slopes can overflow, and are not needed where the energy is linear in E. */
         const double by_a = e > linear_from ? 0 : slopes->a[j], by_b = e > linear_from ? 0 : slopes->b[j];
         slopes->a[j] *= factor;
         slopes->b[j] *= factor;
