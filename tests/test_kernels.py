@@ -126,6 +126,7 @@ _ANY_LENGTH = {
     "fill_cells": {2},
     "mark_near": {4},
     "gather_part": {4},
+    "find_shortest_paths": {4},
     "walk_stretches": {1},
     "jacobians": {0},
     "pulls": {5},

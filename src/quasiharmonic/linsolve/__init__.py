@@ -69,7 +69,14 @@ def takes_order(name: str = "auto") -> bool:
     return _backend(chosen).takes_order
 
 
-def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", ordered: bool = False) -> LinearSolver:
+def make_solver(
+    indptr: ArrayLike,
+    indices: ArrayLike,
+    *,
+    name: str = "auto",
+    ordered: bool = False,
+    semidefinite: bool = False,
+) -> LinearSolver:
     """Analyse the pattern of a symmetric matrix with the best backend present, or with the one named.
 
     Parameters
@@ -82,6 +89,8 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
     ordered : bool
         Whether the unknowns are numbered such that elimination in this order gives a sparse factor, as
         by `quasiharmonic.linsolve.dissection`. If so, a backend that accepts an order does not compute its own.
+    semidefinite : bool
+        Whether the matrices are sums of positive semidefinite ones. Then a backend may leave out a slow test of pivots.
 
     Returns
     -------
@@ -99,7 +108,7 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
     if name == "auto":
         for candidate in available(np.size(indices)):
             try:
-                return _backend(candidate)(indptr, indices, ordered=ordered)
+                return _backend(candidate)(indptr, indices, ordered=ordered, semidefinite=semidefinite)
             except ImportError:
                 continue  # installed but broken; the last candidate is part of SciPy and always loads
     backend = _backend(name)
@@ -108,4 +117,4 @@ def make_solver(indptr: ArrayLike, indices: ArrayLike, *, name: str = "auto", or
             f"linear solver {name!r} is not installed; available: {', '.join(available())}. "
             f"To install it: {backend.requirement}"
         )
-    return backend(indptr, indices, ordered=ordered)
+    return backend(indptr, indices, ordered=ordered, semidefinite=semidefinite)

@@ -173,6 +173,9 @@ class LinearSolver(ABC):
     ordered : bool
         Whether the unknowns are numbered such that elimination in this order gives a sparse factor. If so, the
         backend does not compute an order. No effect if `takes_order` is False.
+    semidefinite : bool
+        Whether the matrices are sums of positive semidefinite ones, so that only rounding or a singular matrix gives
+        pivots that are not positive. The backend may then rely on the test of the residual.
 
     Raises
     ------
@@ -193,8 +196,10 @@ class LinearSolver(ABC):
     #: Whether the backend can use a given numbering instead of computing an order.
     takes_order: ClassVar[bool] = True
 
-    def __init__(self, indptr: ArrayLike, indices: ArrayLike, *, ordered: bool = False) -> None:
-        self._ordered = ordered
+    def __init__(
+        self, indptr: ArrayLike, indices: ArrayLike, *, ordered: bool = False, semidefinite: bool = False
+    ) -> None:
+        self._ordered, self._semidefinite = ordered, semidefinite
         self._indptr, self._indices = _check_pattern(indptr, indices)
         self.n = len(self._indptr) - 1
         self.nnz = len(self._indices)

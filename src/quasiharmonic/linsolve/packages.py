@@ -118,8 +118,10 @@ class Qdldl(LinearSolver):
         except RuntimeError:
             raise NotPositiveDefinite("the matrix is not positive definite: QDLDL found a pivot that is zero") from None
         # LDLᵀ exists for indefinite matrices as well, and QDLDL may continue after a zero pivot without an error. Only
-        # the signs of D are a reliable test. QDLDL returns D with a copy of L, which takes a quarter of the
-        # factorisation time.
+        # the signs of D are a reliable test. QDLDL returns D with a copy of L, which takes as long as the factorisation
+        # of a small matrix.
+        if self._semidefinite:
+            return
         pivots = self._solver.factors()[1]
         if not pivots.min() > 0:
             raise NotPositiveDefinite("the matrix is not positive definite: QDLDL found a pivot that is not positive")

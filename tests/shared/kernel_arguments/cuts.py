@@ -33,6 +33,23 @@ for seeds, rings in ((1, 1), (1, 3), (9, 2), (40, 1), (0, 2)):
     arguments_of("gather_part")(partial(part_of_disk, seeds=seeds, rings=rings))
 
 
+def paths_on_disk(rng: np.random.Generator, costs: str, sources: int, limit: float) -> Arguments:
+    """Some vertices of a mesh, a few of them twice, and costs of its edges, some of them infinite."""
+    V, F = disk(9)
+    graph = edge_graph(V, F)
+    count, start = len(graph.ends), np.append(0, np.cumsum(np.bincount(graph.ends.ravel())))
+    order = np.argsort(graph.ends.ravel(), kind="stable")
+    cost = {"equal": np.ones(count), "few": rng.integers(1, 4, count).astype(float), "own": graph.cost}[costs]
+    cost[rng.random(count) < 0.05] = np.inf
+    chosen = rng.integers(len(V), size=sources)
+    return start, graph.ends[:, ::-1].ravel()[order], order // 2, cost, chosen, limit, np.zeros(len(V)), 0 * start[1:]
+
+
+for costs in ("equal", "few", "own"):
+    for sources, limit in ((1, np.inf), (20, np.inf), (1, 4.0), (20, 0.5)):
+        arguments_of("find_shortest_paths")(partial(paths_on_disk, costs=costs, sources=sources, limit=limit))
+
+
 def some_edges(rng: np.random.Generator, share: float) -> Arguments:
     """Edges of a disk, with branches, loops and paths without nodes."""
     V, F = disk(9)

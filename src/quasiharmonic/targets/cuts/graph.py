@@ -11,7 +11,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -25,6 +24,7 @@ from quasiharmonic.util.arrays import (
     enumerate_each,
     mark,
     pad_to_space,
+    repeat_each,
     scale_to_unit,
 )
 from quasiharmonic.util.kernels import compiled
@@ -147,19 +147,18 @@ class EdgeGraph:
         return np.searchsorted(pair_keys(self.ends, self.n), edge_keys(tail, head, self.n))
 
     @cached_property
-    def _rows(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        """Neighbours (2 e,) of each vertex, the edges to them (2 e,), and where those of each vertex start (n + 1,)."""
+    def _rows(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Where the neighbours of each vertex start (n + 1,), the neighbours (2 e,), and the edges to them (2 e,)."""
         count, (smaller, larger) = len(self.ends), self.ends.T
         above = np.searchsorted(smaller, np.arange(self.n + 1))
         columns = csr_array((np.arange(count), larger, above), shape=(self.n, self.n)).tocsc()
         below, of_larger = columns.indptr, columns.data
         # At each vertex, its larger neighbours come first.
         first, second = np.arange(count) + below[smaller], np.arange(count) + above[1:][larger[of_larger]]
-        # Before version 1.17, SciPy's graph searches accept 32-bit indices only.
-        neighbour, edge = np.empty((2, 2 * count), dtype=np.int32)
+        neighbour, edge = np.empty((2, 2 * count), dtype=np.int64)
         neighbour[first], neighbour[second] = larger, smaller[of_larger]
         edge[first], edge[second] = np.arange(count), of_larger
-        return neighbour, edge, (above + below).astype(np.int32)
+        return above + below.astype(np.int64), neighbour, edge
 
     def distances(self, sources: IntArray, weight: FloatArray, limit: float = np.inf) -> tuple[FloatArray, IntArray]:
         """Distance of each vertex from the nearest source, and its predecessor on the shortest path.
@@ -177,13 +176,12 @@ class EdgeGraph:
         distance : (n,) float64
             Infinite where no path exists.
         before : (n,) int64
-            Negative at sources and where no path exists.
+            Negative at sources and where no path exists. Of several shortest paths to a vertex, the one is used whose
+            last but one vertex is the smallest.
         """
-        neighbour, edge, start = self._rows
-        # With ``directed=False``, SciPy would copy and transpose the graph first, which takes half of the time.
-        graph = csr_array((weight.take(edge), neighbour, start), shape=(self.n, self.n))
-        distance, before, _ = dijkstra(graph, indices=sources, return_predecessors=True, min_only=True, limit=limit)
-        return distance, before.astype(np.int64)
+        distance, before = np.empty(self.n), np.empty(self.n, dtype=np.int64)
+        find_shortest_paths(*self._rows, weight, sources, limit, distance, before)
+        return distance, before
 
     def way_back(self, before: IntArray, start: int) -> IntArray:
         """Edges of the path from a vertex back to its source, in order; ``before`` as returned by `distances`."""
@@ -191,6 +189,32 @@ class EdgeGraph:
         while before[way[-1]] >= 0:
             way.append(int(before[way[-1]]))
         return self.numbers(np.array(way[:-1], dtype=np.int64), np.array(way[1:], dtype=np.int64))
+
+
+@compiled
+def find_shortest_paths(
+    start: IntArray,
+    neighbour: IntArray,
+    edge: IntArray,
+    weight: FloatArray,
+    sources: IntArray,
+    limit: float,
+    distance: FloatArray,
+    before: IntArray,
+) -> None:
+    """Fill in the results (n,) of `EdgeGraph.distances`, given `EdgeGraph._rows`."""
+    n, along = distance.size, weight.take(edge)
+    # Before version 1.17, SciPy's graph searches accept 32-bit indices only. With ``directed=False``, SciPy would copy
+    # and transpose the graph first, which takes half of the time.
+    graph = csr_array((along, neighbour.astype(np.int32), start.astype(np.int32)), shape=(n, n))
+    distance[:], before[:], _ = dijkstra(
+        graph, indices=sources, return_predecessors=True, min_only=True, limit=limit
+    )
+    tail = repeat_each(np.arange(n), np.diff(start))
+    last = (distance[tail] + along == distance[neighbour]) & (distance[tail] < distance[neighbour])
+    # The smallest is written last.
+    before[neighbour[last][::-1]] = tail[last][::-1]
+    before[(before < 0) | np.isinf(distance)] = -1
 
 
 def triangles_near(F: IntArray, marked: BoolArray, rings: int) -> BoolArray:

@@ -163,7 +163,8 @@ class Shrinking:
         self._diagonal, self._above = indptr[:-1], np.arange(e) + graph.ends[:, 0] + 1
         indices = np.empty(n + e, dtype=np.int32)
         indices[self._diagonal], indices[self._above] = np.arange(n), graph.ends[:, 1]
-        self._solver = make_solver(indptr, indices)
+        # The stiffness of a triangle whose angles have the sum π is positive semidefinite.
+        self._solver = make_solver(indptr, indices, semidefinite=True)
 
     def of(self, open_at: BoolArray) -> FloatArray:
         """Logarithm w of the factor by which the map shrinks lengths.

@@ -181,11 +181,12 @@ def _find_cheapest_path(graph: EdgeGraph, cut: BoolArray, way: IntArray) -> IntA
     limit = (1 - _SAVES) * float(graph.cost[way].sum())
     if loose.size == 0:
         return _find_path_across(graph, way, others, held, limit)
+    distance, before = graph.distances(loose[:1], graph.cost, limit=limit)
     goals = np.flatnonzero(held) if loose.size == 1 else loose[1:]
-    distance, before = graph.distances(goals, graph.cost, limit=limit)
-    if np.isinf(distance[loose[0]]):
+    goal = int(goals[np.argmin(distance[goals])])
+    if np.isinf(distance[goal]):
         return None
-    instead = graph.way_back(before, int(loose[0]))
+    instead = graph.way_back(before, goal)
     # A single edge between interior vertices opens nothing.
     return None if loose.size == 2 and instead.size == 1 else instead
 

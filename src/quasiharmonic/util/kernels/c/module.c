@@ -14,6 +14,7 @@
     with(nested_grid) \
     with(newton_system) \
     with(part) \
+    with(paths) \
     with(pattern) \
     with(placing) \
     with(point_location) \

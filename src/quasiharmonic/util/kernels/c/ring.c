@@ -1,5 +1,6 @@
 /* Kernels of `targets/cuts/shortening.py`. */
 #include "arguments.h"
+#include "heap.h"
 
 #include <math.h>
 #include <stdlib.h>
@@ -10,15 +11,13 @@ typedef struct {
     const int64_t *opposite, *side;
     const char *border;
     const double *cost;
-    /* The node of each corner: the smallest corner of its part of a vertex. */
-    int64_t *node, *loop;
+    /* The half-edge across each half-edge, -1 at borders and where no triangle follows; the node of each corner: the
+     * smallest corner of its part of a vertex; and the loop of border edges of each node, -1 away from borders. */
+    int64_t *across, *node, *loop;
     double *distance;
+    /* No path is longer. */
+    double limit;
 } Ring;
-
-typedef struct {
-    double distance;
-    int64_t node;
-} Entry;
 
 static int64_t next_of(int64_t half)
 {
@@ -47,65 +46,48 @@ static void join_labels(int64_t *label, int64_t one, int64_t other)
         label[one] = other;
 }
 
-/* Number the nodes, and the loops of border edges; a loop is -1 away from borders. */
+/* Number the corners around a vertex, from the smallest one of its part in both directions. */
+static void label_fan(const Ring *ring, int64_t smallest)
+{
+    int64_t corner = smallest;
+    for (;;) {
+        ring->node[corner] = smallest;
+        const int64_t across = ring->across[corner];
+        if (across < 0)
+            break;
+        corner = next_of(across);
+        if (corner == smallest)
+            return;
+    }
+    corner = smallest;
+    for (;;) {
+        corner = ring->across[previous_of(corner)];
+        if (corner < 0)
+            return;
+        ring->node[corner] = smallest;
+    }
+}
+
+/* Number the nodes and the loops. */
 static void label_nodes(const Ring *ring, int64_t halves)
 {
-    for (int64_t h = 0; h < halves; h++)
-        ring->node[h] = h;
     for (int64_t h = 0; h < halves; h++) {
-        const int64_t across = ring->opposite[h];
-        if (across < 0 || ring->border[ring->side[h]])
-            continue;
-        join_labels(ring->node, h, next_of(across));
+        ring->across[h] = ring->border[ring->side[h]] ? -1 : ring->opposite[h];
+        ring->node[h] = ring->loop[h] = -1;
     }
     for (int64_t h = 0; h < halves; h++)
-        ring->node[h] = root(ring->node, h);
+        if (ring->node[h] < 0)
+            label_fan(ring, h);
     for (int64_t h = 0; h < halves; h++)
-        ring->loop[h] = -1;
-    for (int64_t h = 0; h < halves; h++)
-        if (ring->border[ring->side[h]]) {
+        if (ring->across[h] < 0 && ring->border[ring->side[h]]) {
             const int64_t tail = ring->node[h], head = ring->node[next_of(h)];
-            ring->loop[tail] = tail;
-            ring->loop[head] = head;
+            ring->loop[tail] = ring->loop[tail] < 0 ? tail : ring->loop[tail];
+            ring->loop[head] = ring->loop[head] < 0 ? head : ring->loop[head];
+            join_labels(ring->loop, tail, head);
         }
-    for (int64_t h = 0; h < halves; h++)
-        if (ring->border[ring->side[h]])
-            join_labels(ring->loop, ring->node[h], ring->node[next_of(h)]);
     for (int64_t h = 0; h < halves; h++)
         if (ring->loop[h] >= 0)
             ring->loop[h] = root(ring->loop, h);
-}
-
-static int comes_before(Entry one, Entry other)
-{
-    return one.distance < other.distance || (one.distance == other.distance && one.node < other.node);
-}
-
-static void push(Entry *heap, int64_t *size, Entry entry)
-{
-    int64_t at = (*size)++;
-    for (; at > 0 && comes_before(entry, heap[(at - 1) / 2]); at = (at - 1) / 2)
-        heap[at] = heap[(at - 1) / 2];
-    heap[at] = entry;
-}
-
-static Entry pop(Entry *heap, int64_t *size)
-{
-    const Entry first = heap[0], last = heap[--*size];
-    int64_t at = 0;
-    for (;;) {
-        int64_t child = 2 * at + 1;
-        if (child >= *size)
-            break;
-        if (child + 1 < *size && comes_before(heap[child + 1], heap[child]))
-            child++;
-        if (!comes_before(heap[child], last))
-            break;
-        heap[at] = heap[child];
-        at = child;
-    }
-    heap[at] = last;
-    return first;
 }
 
 typedef struct {
@@ -117,53 +99,57 @@ typedef struct {
 static int64_t next_corner(const Ring *ring, Fan *fan)
 {
     if (!fan->turned) {
-        const int64_t across = ring->opposite[fan->corner];
-        if (across >= 0 && !ring->border[ring->side[fan->corner]]) {
+        const int64_t across = ring->across[fan->corner];
+        if (across >= 0) {
             fan->corner = next_of(across);
             return fan->corner == fan->begun ? -1 : fan->corner;
         }
         fan->turned = 1;
         fan->corner = fan->begun;
     }
-    const int64_t before = previous_of(fan->corner), across = ring->opposite[before];
-    if (across < 0 || ring->border[ring->side[before]])
+    const int64_t across = ring->across[previous_of(fan->corner)];
+    if (across < 0)
         return -1;
     return fan->corner = across;
 }
 
+/* Shorten the distance of a neighbour along a half-edge. */
+static void relax(const Ring *ring, Heap *heap, double distance, int64_t half, int64_t other)
+{
+    const double longer = distance + ring->cost[ring->side[half]];
+    if (longer <= ring->limit && longer < ring->distance[other]) {
+        ring->distance[other] = longer;
+        push(heap, (Entry){longer, other});
+    }
+}
+
 /* Shorten the distances of the neighbours of a node. */
-static void relax(const Ring *ring, Entry here, int64_t far, int64_t near, double limit, Entry *heap, int64_t *size)
+static void relax_around(const Ring *ring, Heap *heap, Entry here)
 {
     Fan fan = {here.node, here.node, 0};
     for (int64_t corner = here.node; corner >= 0; corner = next_corner(ring, &fan)) {
         const int64_t before = previous_of(corner);
-        const int64_t halves[2] = {corner, before}, others[2] = {next_of(corner), before};
-        for (int k = 0; k < 2; k++) {
-            const int64_t edge = ring->side[halves[k]], other = ring->node[others[k]], loop = ring->loop[other];
-            if (ring->border[edge] || (loop >= 0 && loop != far && loop != near))
-                continue;
-            const double longer = here.distance + ring->cost[edge];
-            if (longer <= limit && longer < ring->distance[other]) {
-                ring->distance[other] = longer;
-                push(heap, size, (Entry){longer, other});
-            }
-        }
+        if (ring->across[corner] >= 0 || !ring->border[ring->side[corner]])
+            relax(ring, heap, here.distance, corner, ring->node[next_of(corner)]);
+        /* Inside, the next triangle of the fan has this edge. */
+        if (ring->across[before] < 0 && !ring->border[ring->side[before]])
+            relax(ring, heap, here.distance, before, ring->node[before]);
     }
 }
 
 /* Write the edges of the cheapest path from a loop to another; their number. */
-static int64_t search(const Ring *ring, int64_t halves, int64_t near, int64_t far, double limit, Entry *heap,
-                      int64_t *path)
+static int64_t search(const Ring *ring, int64_t halves, int64_t near, int64_t far, Heap *heap, int64_t *path)
 {
-    int64_t size = 0, end = -1, length = 0;
+    int64_t end = -1, length = 0;
     for (int64_t h = 0; h < halves; h++) {
-        const int source = ring->node[h] == h && ring->loop[h] == near;
-        ring->distance[h] = source ? 0 : INFINITY;
-        if (source)
-            push(heap, &size, (Entry){0, h});
+        const int64_t loop = ring->loop[h];
+        /* No path leads through nodes on other loops. */
+        ring->distance[h] = loop < 0 || loop == far ? INFINITY : loop == near ? 0 : -INFINITY;
+        if (loop == near)
+            push(heap, (Entry){0, h});
     }
-    while (size > 0) {
-        const Entry here = pop(heap, &size);
+    while (heap->size > 0) {
+        const Entry here = pop(heap);
         if (here.distance > ring->distance[here.node])
             continue;
         if (end >= 0 && here.distance > ring->distance[end])
@@ -173,7 +159,7 @@ static int64_t search(const Ring *ring, int64_t halves, int64_t near, int64_t fa
                 end = here.node;
             continue;
         }
-        relax(ring, here, far, near, limit, heap, &size);
+        relax_around(ring, heap, here);
     }
     while (end >= 0 && ring->distance[end] > 0 && length < halves) {
         int64_t edge = -1, from = -1;
@@ -211,7 +197,7 @@ static PyObject *cross_ring(PyObject *module, PyObject *const *given, Py_ssize_t
              halves % 3 == 0 && a[1].size == halves && a[2].size == a[3].size && a[7].size == halves && 0 <= start
                  && start < halves && 0 <= goal && goal < halves))
         return NULL;
-    int64_t *labels = malloc((size_t)halves * 2 * sizeof(*labels));
+    int64_t *labels = malloc((size_t)halves * 3 * sizeof(*labels));
     double *distance = malloc((size_t)halves * sizeof(*distance));
     /* Every node is a source at most once, and every edge improves each of its ends at most once. */
     Entry *heap = malloc((size_t)halves * 3 * sizeof(*heap));
@@ -223,11 +209,12 @@ static PyObject *cross_ring(PyObject *module, PyObject *const *given, Py_ssize_t
     }
     int64_t length = 0;
     Py_BEGIN_ALLOW_THREADS
-    const Ring ring = {a[0].data, a[1].data, a[2].data, a[3].data, labels, labels + halves, distance};
+    const Ring ring = {a[0].data, a[1].data, a[2].data, a[3].data, labels, labels + halves,
+                       labels + 2 * halves, distance, a[6].number};
     label_nodes(&ring, halves);
     const int64_t near = ring.loop[ring.node[start]], far = ring.loop[ring.node[goal]];
     if (near >= 0 && far >= 0 && near != far)
-        length = search(&ring, halves, near, far, a[6].number, heap, a[7].data);
+        length = search(&ring, halves, near, far, &(Heap){heap, 0}, a[7].data);
     Py_END_ALLOW_THREADS
     free(labels);
     free(distance);
