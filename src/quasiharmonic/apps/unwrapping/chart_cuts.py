@@ -34,7 +34,7 @@ class CutTuning(NamedTuple):
     # A line stays between these values of the relative distance from its two ends.
     band: tuple[float, float] = (0.25, 0.75)
     # The band of a large chart is narrowed until it has at most this number of triangles.
-    max_band: int = 3_000
+    max_band: int = 1_500
     # Around each end, up to this distance, triangles belong to the nearer end; the chart has area 1.
     reach: float = 0.15
     # Lines between overlapping parts: maximum number of boundary positions that are compared.

@@ -55,6 +55,9 @@ class ChartTuning(NamedTuple):
     least_energy: float = 0.1
     # Number of quasi-Newton steps that count as one step.
     window: int = 5
+    # The same two numbers for a descent that only prepares the descent of another energy.
+    slow_at_first: float = 0.3
+    window_at_first: int = 3
     # From mean energies below this, quasi-Newton steps are used.
     near: float = 3.0
     # Charts with at most this number of vertices get the linear solver for small systems. It takes half the time there,
@@ -211,7 +214,9 @@ def flatten_chart(chart: WorkingChart, bound: float, check_wanted: Callable[[], 
         if chart.start is not None:
             _relax_long(chart, bound)
         if flat is None and (chart.start is None or chart.too_long.any()):
-            _descend(chart, SymmetricDirichlet(), check_wanted)
+            _descend(chart, SymmetricDirichlet(), check_wanted, at_first=True)
+            if keeps_bound(chart, bound):
+                _descend(chart, SymmetricDirichlet(), check_wanted)
             _relax_long(chart, bound)
         if keeps_bound(chart, bound):
             return
@@ -238,12 +243,20 @@ def keeps_bound(chart: WorkingChart, bound: float) -> bool:
 
 
 @np.errstate(all="ignore")
-def _descend(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> None:
-    """Lower an energy of the chart's map, which stays injective."""
+def _descend(
+    chart: WorkingChart, density: Energy, check_wanted: Callable[[], object], *, at_first: bool = False
+) -> None:
+    """Lower an energy of the chart's map, which stays injective.
+
+    ``at_first`` ends the quasi-Newton steps earlier, since another descent follows.
+    """
     assert chart.uv is not None
     try:
         if _approach(chart, density, _TUNING.near, check_wanted):
-            _finish(chart, density, check_wanted)
+            slow, window = _TUNING.slow, _TUNING.window
+            if at_first:
+                slow, window = _TUNING.slow_at_first, _TUNING.window_at_first
+            _finish(chart, density, check_wanted, slow, window)
     except NotPositiveDefinite:
         # Newton's system can be made positive definite where rounding prevents that for the Laplacian.
         _approach(chart, density, _TUNING.nothing, check_wanted)
@@ -273,15 +286,17 @@ def _approach(chart: WorkingChart, density: Energy, near: float, check_wanted: C
     return False
 
 
-def _finish(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object]) -> None:
-    """Take quasi-Newton steps until they are slow."""
+def _finish(
+    chart: WorkingChart, density: Energy, check_wanted: Callable[[], object], slow: float, window: int
+) -> None:
+    """Take quasi-Newton steps until ``window`` of them lower the energy by less than the share ``slow``."""
     assert chart.uv is not None
     descent = LaplacianDescent(chart.piece.energy(density, None), chart.uv, chart.linear_solver)
     values = [descent.value]
     while len(values) <= _TUNING.max_steps and values[-1] >= _TUNING.nothing and descent.step():
         chart.uv = descent.uv
         check_wanted()
-        if len(values) >= _TUNING.window and descent.value > (1 - _TUNING.slow) * values[-_TUNING.window]:
+        if len(values) >= window and descent.value > (1 - slow) * values[-window]:
             break
         values.append(descent.value)
 

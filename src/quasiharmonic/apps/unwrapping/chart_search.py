@@ -61,7 +61,7 @@ class SearchTuning(NamedTuple):
     """Numbers that tune the search: first it aims at a lower bound than the given one, then it keeps the given one."""
 
     # The aim for all other charts, as a fraction of the permitted stretch.
-    aim: float = 0.62
+    aim: float = 0.65
     # Maximum number of rounds in which charts are cut further to reach the aim.
     aim_rounds: int = 12
     # Maximum number of rounds to keep the bound.

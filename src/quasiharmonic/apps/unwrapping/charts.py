@@ -62,8 +62,8 @@ def find_charts(
     F : (f, 3) int64
         Triangles of manifold, consistently oriented surfaces without degenerate triangles.
     max_stretch : float
-        Bound of at least 1. While that takes only a few more charts, the search goes on to three fifths of the stretch
-        that the bound permits, to 1.3 by default.
+        Bound of at least 1. While that takes only a few more charts, the search goes on to two thirds of the stretch
+        that the bound permits, to about 1.3 by default.
     max_charts : int, optional
         Maximum number of charts. It is exceeded only by components, and by parts without an injective map.
     edge_costs : (f, 3) float64, optional
