@@ -23,7 +23,7 @@ MANY = 50
 #: Charts beyond this number are placed as boxes, the smallest ones.
 BITMAPS = 500
 #: Placements tried with other orders of the charts, in all.
-TRIALS = 60
+TRIALS = 80
 #: Largest number of cells along a tile.
 MOST_CELLS = 2048
 #: The number of cells along a tile is at most this multiple of the expected number.
