@@ -25,6 +25,12 @@ FACADE = {"__init__", "__main__", "atlas", "batch", "jax", "plot", "results", "s
 
 
 @cache
+def parse(path):
+    """The syntax tree of a file, which nobody changes."""
+    return ast.parse(path.read_text(encoding="utf-8"), path)
+
+
+@cache
 def is_module(parts):
     """Whether a module or package has this dotted name, given as parts after the library's name."""
     path = ROOT.joinpath(*parts)
@@ -67,7 +73,7 @@ def imported(tree):
 def imports_of_files():
     """A dictionary from every file, relative to the library's folder, to the list of modules that it imports."""
     return {
-        path.relative_to(ROOT): list(imported(ast.parse(path.read_text(encoding="utf-8"), path)))
+        path.relative_to(ROOT): list(imported(parse(path)))
         for path in sorted(ROOT.rglob("*.py"))
         if path.relative_to(ROOT).with_suffix("").parts[0] not in FACADE
     }
@@ -180,7 +186,7 @@ def graph_of_files(trees, lazy):
 
 @pytest.mark.long
 def test_no_circle_of_files():
-    trees = {module_of(path): ast.parse(path.read_text(encoding="utf-8"), path) for path in ROOT.rglob("*.py")}
+    trees = {module_of(path): parse(path) for path in ROOT.rglob("*.py")}
     lazy = {module_of(path.with_suffix(".py")): lazy_names(path) for path in ROOT.rglob("__init__.pyi")}
     graph = graph_of_files(trees, lazy)
     assert ("io", "mesh_files") in graph["ui", "cli", "pipeline"]
@@ -218,7 +224,7 @@ def test_every_package_states_where_to_start_reading():
     silent = [
         str(path.relative_to(ROOT))
         for path in ROOT.rglob("__init__.py")
-        if "Start reading" not in (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "")
+        if "Start reading" not in (ast.get_docstring(parse(path)) or "")
         and path.parent != ROOT
         and "c" not in path.relative_to(ROOT).parts
     ]
@@ -243,7 +249,7 @@ def test_every_class_has_a_name_of_its_own():
     """A leading underscore makes no difference to a reader."""
     found: dict[str, list[str]] = {}
     for path in sorted(ROOT.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parse(path)):
             if isinstance(node, ast.ClassDef):
                 found.setdefault(node.name.lstrip("_"), []).append(path.relative_to(ROOT).as_posix())
     twice = {name: paths for name, paths in found.items() if len(paths) > 1}

@@ -161,3 +161,18 @@ def test_unknowns_in_a_good_order(name):
             indefinite[A.indptr[:-1]] -= 1.5 * smallest
             with pytest.raises(NotPositiveDefinite, match="not positive definite"):
                 solver.factor(indefinite)
+
+
+def test_semidefinite_matrices_are_solved_and_singular_ones_found(name):
+    """Without the test of pivots, the residual shows that a matrix is singular."""
+    A = stiffness(20)
+    rhs = np.random.default_rng(0).standard_normal(400)
+    with solver_for(A, name, semidefinite=True) as solver:
+        solver.factor(A.data)
+        np.testing.assert_array_equal(solver.solve(rhs), solve(A, rhs, name))
+        whole = both(A)
+        singular = A.data.copy()
+        singular[A.indptr[:-1]] -= whole.sum(axis=1)
+        with pytest.raises(NotPositiveDefinite, match="not .*positive definite"):
+            solver.factor(singular)
+            solver.solve(rhs)

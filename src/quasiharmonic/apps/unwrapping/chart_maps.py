@@ -286,9 +286,7 @@ def _approach(chart: WorkingChart, density: Energy, near: float, check_wanted: C
     return False
 
 
-def _finish(
-    chart: WorkingChart, density: Energy, check_wanted: Callable[[], object], slow: float, window: int
-) -> None:
+def _finish(chart: WorkingChart, density: Energy, check_wanted: Callable[[], object], slow: float, window: int) -> None:
     """Take quasi-Newton steps until ``window`` of them lower the energy by less than the share ``slow``."""
     assert chart.uv is not None
     descent = LaplacianDescent(chart.piece.energy(density, None), chart.uv, chart.linear_solver)

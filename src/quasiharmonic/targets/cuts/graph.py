@@ -207,9 +207,7 @@ def find_shortest_paths(
     # Before version 1.17, SciPy's graph searches accept 32-bit indices only. With ``directed=False``, SciPy would copy
     # and transpose the graph first, which takes half of the time.
     graph = csr_array((along, neighbour.astype(np.int32), start.astype(np.int32)), shape=(n, n))
-    distance[:], before[:], _ = dijkstra(
-        graph, indices=sources, return_predecessors=True, min_only=True, limit=limit
-    )
+    distance[:], before[:], _ = dijkstra(graph, indices=sources, return_predecessors=True, min_only=True, limit=limit)
     tail = repeat_each(np.arange(n), np.diff(start))
     last = (distance[tail] + along == distance[neighbour]) & (distance[tail] < distance[neighbour])
     # The smallest is written last.
