@@ -26,7 +26,7 @@ FACADE = {"__init__", "__main__", "atlas", "batch", "jax", "plot", "results", "s
 
 @cache
 def parse(path):
-    """The syntax tree of a file, which nobody changes."""
+    """Return the syntax tree of a file; tests do not change it."""
     return ast.parse(path.read_text(encoding="utf-8"), path)
 
 

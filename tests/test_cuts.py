@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -125,6 +127,25 @@ class TestShortest:
         cut = find_cuts(V, F, min_gain=np.inf)
         number = graph.numbers(*cut.T)
         assert graph.cost[number].sum() < 0.9 * graph.length[number].sum()
+
+    def test_a_cut_ends_where_it_first_meets_the_boundary(self):
+        """Further along the boundary, the distance is the same after rounding."""
+        V, F = surfaces.grid(6, 6)
+        place = np.rint(V * 6).astype(int)
+        number = {(x, y): k for k, (x, y) in enumerate(place.tolist())}
+        graph = edge_graph(V, F)
+
+        def along(*corners):
+            vertices = np.array([number[corner] for corner in corners])
+            return graph.numbers(vertices[:-1], vertices[1:])
+
+        cost = graph.cost.copy()
+        cost[along((2, 0), (3, 0))] = 1e-20
+        straight = along((3, 3), (3, 2), (3, 1), (3, 0))
+        cost[straight] *= 0.5
+        cut = np.zeros(len(cost), dtype=bool)
+        cut[along((3, 3), (4, 3), (5, 3), (5, 2), (5, 1), (5, 0))] = True
+        assert np.flatnonzero(shorten_cuts(replace(graph, cost=cost), cut)).tolist() == sorted(straight.tolist())
 
 
 class TestGain:

@@ -233,7 +233,8 @@ class LinearSolver(ABC):
         Raises
         ------
         NotPositiveDefinite
-            If a pivot or a diagonal entry is not positive, or an entry is not finite.
+            If a diagonal entry is not positive, or an entry is not finite. If a pivot is not positive, unless the
+            matrix is ``semidefinite``: then `solve` may raise it.
         ValueError
             If the array has the wrong shape, or the solver is closed.
         """

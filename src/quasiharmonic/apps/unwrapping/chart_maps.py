@@ -55,7 +55,7 @@ class ChartTuning(NamedTuple):
     least_energy: float = 0.1
     # Number of quasi-Newton steps that count as one step.
     window: int = 5
-    # The same two numbers for a descent that only prepares the descent of another energy.
+    # ``slow`` and ``window`` of a first descent, which usually only prepares the descent of another energy.
     slow_at_first: float = 0.3
     window_at_first: int = 3
     # From mean energies below this, quasi-Newton steps are used.

@@ -177,7 +177,7 @@ class EdgeGraph:
             Infinite where no path exists.
         before : (n,) int64
             Negative at sources and where no path exists. Of several shortest paths to a vertex, the one is used whose
-            last but one vertex is the smallest.
+            last but one vertex is the smallest, unless rounding makes that vertex equally far.
         """
         distance, before = np.empty(self.n), np.empty(self.n, dtype=np.int64)
         find_shortest_paths(*self._rows, weight, sources, limit, distance, before)

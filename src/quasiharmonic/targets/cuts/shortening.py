@@ -186,6 +186,10 @@ def _find_cheapest_path(graph: EdgeGraph, cut: BoolArray, way: IntArray) -> IntA
     goal = int(goals[np.argmin(distance[goals])])
     if np.isinf(distance[goal]):
         return None
+    # After rounding, several goals may be equally near: the path ends at the first one.
+    is_goal, at = mark(graph.n, goals), goal
+    while (at := int(before[at])) >= 0:
+        goal = at if is_goal[at] else goal
     instead = graph.way_back(before, goal)
     # A single edge between interior vertices opens nothing.
     return None if loose.size == 2 and instead.size == 1 else instead

@@ -43,7 +43,8 @@ static PyObject *find_shortest_paths(PyObject *module, PyObject *const *given, P
                  && are_indices(a + 1, n) && are_indices(a + 2, a[3].size) && are_indices(a + 4, n)))
         return NULL;
     const Graph graph = {a[0].data, a[1].data, a[2].data, a[3].data, a[5].number, a[6].data, a[7].data};
-    /* Every vertex is a source at most once, and has a shorter path from each of its neighbours at most once. */
+    /* No weight is negative. So every vertex is a source at most once, and has a shorter path from each of its neighbours
+     * at most once. */
     Heap heap = {malloc((size_t)(n + a[1].size + 1) * sizeof(Entry)), 0};
     if (!heap.entries)
         return out_of_memory(a, LENGTH(a));
