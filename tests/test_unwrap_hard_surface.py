@@ -231,14 +231,14 @@ def test_rough_spheres_have_few_charts(seed):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("cells", [20, pytest.param(40, marks=pytest.mark.nightly)])
-def test_thousands_of_flat_faces_take_seconds(cells):
+@pytest.mark.parametrize(("cells", "faces"), [(20, 375), pytest.param(40, 1500, marks=pytest.mark.nightly)])
+def test_many_flat_faces_take_seconds(cells, faces):
     V, F = models.terrain(cells, np.random.default_rng(2))
     began = time.process_time()
     result = unwrap(V, F, resolution=2048, padding=1)
     assert time.process_time() - began < 60
     assert result.success
-    assert count_flat_faces(V, F) > 0.9 * cells**2
+    assert count_flat_faces(V, F) > faces
     assert result.n_charts < count_flat_faces(V, F)
     assert cut_flat_edges(V, F, result.indices).tolist() == []
 

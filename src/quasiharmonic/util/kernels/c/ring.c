@@ -46,50 +46,6 @@ static void join_labels(int64_t *label, int64_t one, int64_t other)
         label[one] = other;
 }
 
-/* Number the corners around a vertex, from the smallest one of its part in both directions. */
-static void label_fan(const Ring *ring, int64_t smallest)
-{
-    int64_t corner = smallest;
-    for (;;) {
-        ring->node[corner] = smallest;
-        const int64_t across = ring->across[corner];
-        if (across < 0)
-            break;
-        corner = next_of(across);
-        if (corner == smallest)
-            return;
-    }
-    corner = smallest;
-    for (;;) {
-        corner = ring->across[previous_of(corner)];
-        if (corner < 0)
-            return;
-        ring->node[corner] = smallest;
-    }
-}
-
-/* Number the nodes and the loops. */
-static void label_nodes(const Ring *ring, int64_t halves)
-{
-    for (int64_t h = 0; h < halves; h++) {
-        ring->across[h] = ring->border[ring->side[h]] ? -1 : ring->opposite[h];
-        ring->node[h] = ring->loop[h] = -1;
-    }
-    for (int64_t h = 0; h < halves; h++)
-        if (ring->node[h] < 0)
-            label_fan(ring, h);
-    for (int64_t h = 0; h < halves; h++)
-        if (ring->across[h] < 0 && ring->border[ring->side[h]]) {
-            const int64_t tail = ring->node[h], head = ring->node[next_of(h)];
-            ring->loop[tail] = ring->loop[tail] < 0 ? tail : ring->loop[tail];
-            ring->loop[head] = ring->loop[head] < 0 ? head : ring->loop[head];
-            join_labels(ring->loop, tail, head);
-        }
-    for (int64_t h = 0; h < halves; h++)
-        if (ring->loop[h] >= 0)
-            ring->loop[h] = root(ring->loop, h);
-}
-
 typedef struct {
     int64_t corner, begun;
     int turned;
@@ -111,6 +67,31 @@ static int64_t next_corner(const Ring *ring, Fan *fan)
     if (across < 0)
         return -1;
     return fan->corner = across;
+}
+
+/* Number the nodes and the loops. */
+static void label_nodes(const Ring *ring, int64_t halves)
+{
+    for (int64_t h = 0; h < halves; h++) {
+        ring->across[h] = ring->border[ring->side[h]] ? -1 : ring->opposite[h];
+        ring->node[h] = ring->loop[h] = -1;
+    }
+    for (int64_t h = 0; h < halves; h++)
+        if (ring->node[h] < 0) {
+            Fan fan = {h, h, 0};
+            for (int64_t corner = h; corner >= 0; corner = next_corner(ring, &fan))
+                ring->node[corner] = h;
+        }
+    for (int64_t h = 0; h < halves; h++)
+        if (ring->across[h] < 0 && ring->border[ring->side[h]]) {
+            const int64_t tail = ring->node[h], head = ring->node[next_of(h)];
+            ring->loop[tail] = ring->loop[tail] < 0 ? tail : ring->loop[tail];
+            ring->loop[head] = ring->loop[head] < 0 ? head : ring->loop[head];
+            join_labels(ring->loop, tail, head);
+        }
+    for (int64_t h = 0; h < halves; h++)
+        if (ring->loop[h] >= 0)
+            ring->loop[h] = root(ring->loop, h);
 }
 
 /* Shorten the distance of a neighbour along a half-edge. */
